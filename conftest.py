@@ -1,0 +1,55 @@
+"""What every test run needs: the processor, float64, and kernels that find the library."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+ROOT = Path(__file__).resolve().parent
+
+# Set before JAX is imported, here and in the notebooks' kernels, which inherit it.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ["SOURCE_DATE_EPOCH"] = "0"
+os.environ["PYTHONPATH"] = os.pathsep.join(
+    [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+)
+
+
+import jax  # noqa: E402
+
+jax.config.update("jax_enable_x64", True)  # in this process; a notebook does it for itself
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    # The path in pyproject.toml is relative; make it independent of the current folder.
+    rules = getattr(config.option, "nbval_sanitize_with", None)
+    if rules:
+        config.option.nbval_sanitize_with = str(ROOT / rules)
+    if getattr(config.option, "nbval", False) or getattr(config.option, "nbval_lax", False):
+        run_cells_as_jupyter_does()
+
+
+def run_cells_as_jupyter_does() -> None:
+    """Make nbval store the history, in memory.
+
+    Without a history a trailing semicolon does not hide the value of a cell, so nbval
+    would see an output that neither JupyterLab nor the stored notebook has.
+    """
+    from nbval import kernel
+
+    start = kernel.start_new_kernel
+
+    def start_new_kernel(*args: Any, **kwargs: Any) -> Any:
+        kwargs["extra_arguments"] = ["--HistoryManager.hist_file=:memory:"]
+        return start(*args, **kwargs)
+
+    def execute_cell_input(self: Any, cell_input: str, allow_stdin: bool | None = None) -> Any:
+        return self.kc.execute(
+            cell_input, store_history=True, allow_stdin=allow_stdin, stop_on_error=False
+        )
+
+    kernel.start_new_kernel = start_new_kernel
+    kernel.RunningKernel.execute_cell_input = execute_cell_input
