@@ -25,7 +25,6 @@ PYTHON ?= $(shell for p in python3.11 python3 python; do \
 	if $$p -c '$(RECENT)' >/dev/null 2>&1; then echo $$p; break; fi; done)
 
 export JAX_PLATFORMS ?= cpu
-export PYTHONDONTWRITEBYTECODE :=
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: help book test lab notebooks clean lint types unit nbval html html-strict test-html
@@ -35,15 +34,67 @@ help:
 
 $(STAMP): requirements.txt pyproject.toml
 	@if [ -z "$(PYTHON)" ] || ! "$(PYTHON)" -c '$(RECENT)' >/dev/null 2>&1; then
-		echo "error: Python 3.11 or later was not found; name it with 'make PYTHON=/path/to/python ...'" >&2
+		echo "error: Python 3.11 or later was not found; name it: make PYTHON=/path/to/python" >&2
 		exit 1
 	fi
+	echo "Installing into $(VENV); this takes a minute or two."
 	rm -f $(STAMP) $(LAB_STAMP)
 	[ -x $(BIN)/python ] || "$(PYTHON)" -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet -r requirements.txt
+	# The list is complete, so nothing has to be resolved; modules compile when first used.
+	$(BIN)/python -m pip install --quiet --no-deps --no-compile -r requirements.txt
 	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e .
+	$(BIN)/python -m pip check --quiet
+	# Build matplotlib's font cache now: later it would write a message into a notebook.
+	$(BIN)/python -c 'import matplotlib.font_manager' 2>/dev/null
 	touch $(STAMP)
 
 $(LAB_STAMP): $(STAMP)
-	@$(BIN)/python -m pip install --quiet -c requirements.txt jupyterlab
+	@echo "Installing JupyterLab into $(VENV)."
+	$(BIN)/python -m pip install --quiet -c requirements.txt jupyterlab
 	touch $(LAB_STAMP)
+
+# ---- the book ----
+
+book: html
+	@echo "The book is at $(HTML)/index.html"
+
+html: $(STAMP)
+	@$(BIN)/jupyter-book build --quiet .
+
+notebooks: $(STAMP)
+	@$(BIN)/python scripts/execute_notebooks.py
+
+lab: $(LAB_STAMP)
+	@$(BIN)/jupyter lab --notebook-dir=book
+
+# ---- the checks ----
+
+# In this order: the quick ones first.
+test: $(STAMP)
+	@$(MAKE) --no-print-directory lint types unit nbval html-strict test-html
+	echo "All checks passed: lint, types, unit tests, notebooks, HTML."
+
+lint: $(STAMP)
+	@$(BIN)/ruff check --quiet .
+	$(BIN)/ruff format --check --quiet --exclude '*.ipynb' .
+
+types: $(STAMP)
+	@$(BIN)/mypy --no-error-summary
+
+unit: $(STAMP)
+	@$(BIN)/python -m pytest -q -n 2
+
+nbval: $(STAMP)
+	@$(BIN)/python -m pytest -q -n 2 --dist loadfile --nbval book/
+
+# From scratch: an incremental build does not repeat the warnings of unchanged pages.
+html-strict: $(STAMP)
+	@rm -rf _build
+	$(BIN)/jupyter-book build --quiet . -W -n --keep-going
+
+test-html: $(STAMP)
+	@$(BIN)/python -m pytest -q tests/html
+
+clean:
+	rm -rf $(VENV) _build build dist ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

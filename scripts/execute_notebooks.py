@@ -90,6 +90,7 @@ def execute(path: Path, timeout: int) -> str | None:
         record_timing=False,
         store_widget_state=False,
         coalesce_streams=True,
+        extra_arguments=["--log-level=ERROR"],
     )
     try:
         client.execute()

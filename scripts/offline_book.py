@@ -1,30 +1,38 @@
-"""Sphinx extension: drop duplicate scripts and style sheets from every page.
-
-Several extensions of Jupyter Book add the same file once for every event that they listen
-to. A script that declares a constant then fails at its second run in the browser.
-"""
+"""Sphinx extension: what the built book needs to be free of errors, and of the network."""
 
 from __future__ import annotations
 
 from typing import Any
 
 
-def drop_duplicates(
-    app: Any, pagename: str, templatename: str, context: dict[str, Any], doctree: Any
-) -> None:
-    """Keep the first of equal entries of the page's scripts and style sheets."""
+def use_svg_math(app: Any, config: Any) -> None:
+    """Choose MathJax's SVG output.
+
+    The default of sphinx-mathjax-offline (CHTML) loses thin bars, as the one of a transpose,
+    at normal zoom. That extension sets the path by itself, so _config.yml cannot.
+    """
+    config.mathjax_path = "mathjax/tex-svg.js"
+
+
+def drop_duplicates(app: Any, pagename: str, templatename: str, context: Any, doctree: Any) -> None:
+    """Keep the first of equal scripts and style sheets of a page.
+
+    Some extensions register the same file or line twice; a script that declares a constant
+    then fails at its second run in the browser. The list is changed in place, because
+    extensions that come later still add to it.
+    """
     for kind in ("script_files", "css_files"):
+        kept: list[Any] = []
         seen: set[tuple[str, str]] = set()
-        kept = []
-        for entry in context.get(kind, []):
-            attributes = getattr(entry, "attributes", {})
-            key = (str(getattr(entry, "filename", entry)), str(attributes.get("body", "")))
+        for entry in context[kind]:
+            key = (str(entry.filename or ""), str(entry.attributes.get("body", "")))
             if key not in seen:
                 seen.add(key)
                 kept.append(entry)
-        context[kind] = kept
+        context[kind][:] = kept
 
 
 def setup(app: Any) -> dict[str, bool]:
-    app.connect("html-page-context", drop_duplicates, priority=900)
+    app.connect("config-inited", use_svg_math, priority=900)
+    app.connect("html-page-context", drop_duplicates, priority=0)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
