@@ -7,10 +7,6 @@
 # Needs Python 3.11 or later with pip, and make. Everything else is installed
 # into .venv, once, and again only when requirements.txt or pyproject.toml change.
 
-SHELL := /bin/bash
-.SHELLFLAGS := -eu -o pipefail -c
-.ONESHELL:
-.DELETE_ON_ERROR:
 .DEFAULT_GOAL := book
 
 VENV := .venv
@@ -32,26 +28,27 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile | sed -n '1,8p'
 
+# The list is complete, so nothing has to be resolved; modules compile when first used.
+# The last line but one builds matplotlib's font cache, which would else write a message
+# into the first notebook that draws.
 $(STAMP): requirements.txt pyproject.toml
-	@if [ -z "$(PYTHON)" ] || ! "$(PYTHON)" -c '$(RECENT)' >/dev/null 2>&1; then
-		echo "error: Python 3.11 or later was not found; name it: make PYTHON=/path/to/python" >&2
-		exit 1
+	@if [ -z "$(PYTHON)" ] || ! "$(PYTHON)" -c '$(RECENT)' >/dev/null 2>&1; then \
+		echo "error: Python 3.11 or later was not found; name it: make PYTHON=/path/to/python" >&2; \
+		exit 1; \
 	fi
-	echo "Installing into $(VENV); this takes a minute or two."
-	rm -f $(STAMP) $(LAB_STAMP)
-	[ -x $(BIN)/python ] || "$(PYTHON)" -m venv $(VENV)
-	# The list is complete, so nothing has to be resolved; modules compile when first used.
-	$(BIN)/python -m pip install --quiet --no-deps --no-compile -r requirements.txt
-	$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e .
-	$(BIN)/python -m pip check --quiet
-	# Build matplotlib's font cache now: later it would write a message into a notebook.
-	$(BIN)/python -c 'import matplotlib.font_manager' 2>/dev/null
-	touch $(STAMP)
+	@echo "Installing into $(VENV); this takes a minute or two."
+	@rm -f $(STAMP) $(LAB_STAMP)
+	@[ -x $(BIN)/python ] || "$(PYTHON)" -m venv $(VENV)
+	@$(BIN)/python -m pip install --quiet --no-deps --no-compile -r requirements.txt
+	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e .
+	@$(BIN)/python -m pip check --quiet
+	@$(BIN)/python -c 'import matplotlib.font_manager' 2>/dev/null
+	@touch $(STAMP)
 
 $(LAB_STAMP): $(STAMP)
 	@echo "Installing JupyterLab into $(VENV)."
-	$(BIN)/python -m pip install --quiet -c requirements.txt jupyterlab
-	touch $(LAB_STAMP)
+	@$(BIN)/python -m pip install --quiet -c requirements.txt jupyterlab
+	@touch $(LAB_STAMP)
 
 # ---- the book ----
 
@@ -72,11 +69,11 @@ lab: $(LAB_STAMP)
 # In this order: the quick ones first.
 test: $(STAMP)
 	@$(MAKE) --no-print-directory lint types unit nbval html-strict test-html
-	echo "All checks passed: lint, types, unit tests, notebooks, HTML."
+	@echo "All checks passed: lint, types, unit tests, notebooks, HTML."
 
 lint: $(STAMP)
 	@$(BIN)/ruff check --quiet .
-	$(BIN)/ruff format --check --quiet --exclude '*.ipynb' .
+	@$(BIN)/ruff format --check --quiet --exclude '*.ipynb' .
 
 types: $(STAMP)
 	@$(BIN)/mypy --no-error-summary
@@ -90,11 +87,11 @@ nbval: $(STAMP)
 # From scratch: an incremental build does not repeat the warnings of unchanged pages.
 html-strict: $(STAMP)
 	@rm -rf _build
-	$(BIN)/jupyter-book build --quiet . -W -n --keep-going
+	@$(BIN)/jupyter-book build --quiet . -W -n --keep-going
 
 test-html: $(STAMP)
 	@$(BIN)/python -m pytest -q tests/html
 
 clean:
-	rm -rf $(VENV) _build build dist ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
-	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+	@rm -rf $(VENV) _build build dist ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
