@@ -1,0 +1,47 @@
+"""Frozen dataclasses that are also JAX pytrees.
+
+``jax.tree_util.register_dataclass`` rebuilds an object by calling its class, so that any check
+in the constructor would run on tracers, on placeholders and on gradients, and fail there. The
+registration below rebuilds without the constructor: user input is validated exactly once, where
+it enters, and ``jit``, ``vmap``, ``grad`` and ``tree.map`` work on the same class.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, TypeVar
+
+import jax
+
+T = TypeVar("T")
+
+
+def bypass_init(cls: type[T], **fields: Any) -> T:
+    """Build an instance of the frozen dataclass ``cls`` without validation."""
+    instance = object.__new__(cls)
+    for name, value in fields.items():
+        object.__setattr__(instance, name, value)
+    return instance
+
+
+def register_pytree(cls: type[T], static: tuple[str, ...] = ()) -> type[T]:
+    """Register the dataclass ``cls`` as a pytree; the fields in ``static`` are not leaves."""
+    names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    leaves = tuple(name for name in names if name not in static)
+
+    def flatten_with_keys(instance: T) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
+        children = [(jax.tree_util.GetAttrKey(name), getattr(instance, name)) for name in leaves]
+        return children, tuple(getattr(instance, name) for name in static)
+
+    def flatten(instance: T) -> tuple[list[Any], tuple[Any, ...]]:
+        return [getattr(instance, name) for name in leaves], tuple(
+            getattr(instance, name) for name in static
+        )
+
+    def unflatten(metadata: tuple[Any, ...], children: Any) -> T:
+        fields = dict(zip(leaves, children, strict=True))
+        fields.update(zip(static, metadata, strict=True))
+        return bypass_init(cls, **fields)
+
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+    return cls

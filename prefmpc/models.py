@@ -1,0 +1,195 @@
+"""Models σ of what a person minimises: pure functions of a trajectory, smaller is better."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Protocol, runtime_checkable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from prefmpc._checks import psd_matrix, require_x64, shaped
+from prefmpc._pytree import bypass_init, register_pytree
+from prefmpc.trajectories import Trajectory, random_weights, second_moments
+
+DIAGONAL_MIN = 0.01
+FIRST_MIN = 1.0
+
+
+@runtime_checkable
+class CostModel(Protocol):
+    """What `fit` needs of a σ model: a pytree of weights with three pure functions.
+
+    ``linear_in_features`` promises score(a) − score(b) = score(a − b): then a pair of
+    trajectories enters the loss as one difference of features.
+    """
+
+    linear_in_features: bool
+
+    @staticmethod
+    def features(trajectory: Trajectory) -> Any:
+        """Everything that σ needs of a trajectory; computed once, outside the training loop."""
+
+    def score(self, features: Any) -> Any:
+        """Return σ (...) from features with the same leading shape."""
+
+    def bounds(self) -> tuple[Any, Any]:
+        """Lower and upper bounds on the weights, in the model's own tree structure."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False, init=False)
+class QuadraticCost:
+    """σ(T) = Σ_{k=0}^{N−1} x_kᵀ Q x_k + u_kᵀ R u_k, with Q = L Lᵀ and R likewise.
+
+    Implements eq. (11) of arXiv 2511.22502. The trained weights θ are the entries of the lower
+    triangular Cholesky factors, row by row, so that any θ gives positive semidefinite matrices.
+
+    Parameters
+    ----------
+    Q : array (..., nx, nx)
+        Symmetric positive semidefinite.
+    R : array (..., nu, nu)
+        Symmetric positive definite.
+
+    Raises
+    ------
+    ValueError
+        If Q or R is not symmetric, is indefinite, or holds NaN.
+    """
+
+    theta_Q: Any
+    theta_R: Any
+
+    linear_in_features = True
+
+    def __init__(self, Q: ArrayLike, R: ArrayLike) -> None:
+        Q = psd_matrix("Q", Q)
+        R = psd_matrix("R", R, definite=True)
+        if Q.shape[:-2] != R.shape[:-2]:
+            raise ValueError(
+                f"Q and R must have the same batch shape, got {Q.shape[:-2]} and {R.shape[:-2]}"
+            )
+        object.__setattr__(self, "theta_Q", jnp.asarray(_pack(_semidefinite_factor(Q))))
+        object.__setattr__(self, "theta_R", jnp.asarray(_pack(_semidefinite_factor(R))))
+
+    @property
+    def Q(self) -> Any:
+        """State weight (..., nx, nx)."""
+        factor = _unpack(self.theta_Q)
+        return factor @ jnp.swapaxes(factor, -1, -2)
+
+    @property
+    def R(self) -> Any:
+        """Input weight (..., nu, nu)."""
+        factor = _unpack(self.theta_R)
+        return factor @ jnp.swapaxes(factor, -1, -2)
+
+    @property
+    def theta(self) -> Any:
+        """All weights θ (..., n_Q + n_R): first the factor of Q, then that of R."""
+        return jnp.concatenate([self.theta_Q, self.theta_R], axis=-1)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading shape of a stack of models; () for one."""
+        return tuple(self.theta_Q.shape[:-1])
+
+    def __getitem__(self, index: Any) -> QuadraticCost:
+        """Index the leading dimensions of a stack of models."""
+        if not self.batch_shape:
+            raise IndexError("a single QuadraticCost has no batch dimension to index")
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+    def __call__(self, trajectory: Trajectory) -> Any:
+        """Return σ(T) for every trajectory of a batch, shape (...).
+
+        A stack of models needs a leading shape that broadcasts against the trajectories'.
+        """
+        nx, nu = _size(self.theta_Q), _size(self.theta_R)
+        shaped("trajectory.x", trajectory.x, (None, nx), "time, then the model's states")
+        shaped("trajectory.u", trajectory.u, (None, nu), "time, then the model's inputs")
+        return self.score(self.features(trajectory))
+
+    @staticmethod
+    def features(trajectory: Trajectory) -> Any:
+        """Return the packed second moments (..., n_Q + n_R): σ sees nothing else of a trajectory.
+
+        The lower triangles of S_x and S_u, off-diagonal entries doubled, so that σ is one dot
+        product with the lower triangles of Q and R.
+        """
+        moments = second_moments(trajectory)
+        return jnp.concatenate(
+            [_pack(S + jnp.tril(S, -1)) for S in (moments.Sx, moments.Su)], axis=-1
+        )
+
+    def score(self, features: Any) -> Any:
+        """Return ⟨Q, S_x⟩ + ⟨R, S_u⟩ from the packed second moments."""
+        weights = jnp.concatenate([_pack(self.Q), _pack(self.R)], axis=-1)
+        if not self.batch_shape:
+            return features @ weights  # one matrix product in the training loop
+        return jnp.sum(features * weights, axis=-1)
+
+    def bounds(self) -> tuple[QuadraticCost, QuadraticCost]:
+        """Return the paper's bounds on θ as two models: diagonal ≥ 0.01, its first entry ≥ 1."""
+
+        def lower(theta: Any, first: float) -> Any:
+            rows, columns = np.tril_indices(_size(theta))
+            bound = np.where(rows == columns, DIAGONAL_MIN, -np.inf)
+            bound[0] = first
+            return jnp.broadcast_to(jnp.asarray(bound), theta.shape)
+
+        low = bypass_init(
+            QuadraticCost,
+            theta_Q=lower(self.theta_Q, FIRST_MIN),
+            theta_R=lower(self.theta_R, DIAGONAL_MIN),
+        )
+        high = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.inf), low)
+        return low, high
+
+    @classmethod
+    def random(
+        cls, nx: int, nu: int, *, key: Any, shape: tuple[int, ...] = (), **options: float
+    ) -> QuadraticCost:
+        """Draw a stack of models with `prefmpc.trajectories.random_weights` (same options)."""
+        require_x64()
+        return cls(*random_weights(nx, nu, key=key, shape=shape, **options))
+
+
+register_pytree(QuadraticCost)
+
+
+def _size(theta: Any) -> int:
+    """Return n for a packed triangle of n (n + 1) / 2 entries."""
+    return (int(np.sqrt(8 * theta.shape[-1] + 1)) - 1) // 2
+
+
+def _pack(matrix: Any) -> Any:
+    """Return the lower triangle (..., n (n + 1) / 2), row by row."""
+    rows, columns = np.tril_indices(matrix.shape[-1])
+    return matrix[..., rows, columns]
+
+
+def _unpack(theta: Any) -> Any:
+    """Return the lower triangular matrix (..., n, n) with the entries ``theta``."""
+    n = _size(theta)
+    rows, columns = np.tril_indices(n)
+    # A product with a constant, since XLA's scatter (and its gradient) is slow on a CPU.
+    places = np.zeros((rows.size, n * n))
+    places[np.arange(rows.size), rows * n + columns] = 1.0
+    return (theta @ places).reshape(*theta.shape[:-1], n, n)
+
+
+def _semidefinite_factor(matrix: np.ndarray) -> np.ndarray:
+    """Return the lower triangular L with L Lᵀ = matrix and a nonnegative diagonal."""
+    try:
+        return np.linalg.cholesky(matrix)
+    except np.linalg.LinAlgError:
+        # A singular matrix has no unique Cholesky factor; the QR of a square root gives one.
+        values, vectors = np.linalg.eigh(matrix)
+        root = np.sqrt(np.clip(values, 0, None))[..., None, :] * vectors
+        upper = np.linalg.qr(np.swapaxes(root, -1, -2), mode="r")
+        lower = np.swapaxes(upper, -1, -2)
+        signs = np.where(np.diagonal(lower, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
+        return lower * signs[..., None, :]

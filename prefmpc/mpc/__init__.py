@@ -1,0 +1,7 @@
+"""Controllers that minimise a learned σ; one file for each family of solvers."""
+
+from prefmpc.mpc.batched import BatchedMPC
+from prefmpc.mpc.qp import LinearMPC
+from prefmpc.mpc.solution import MPCError, MPCSolution
+
+__all__ = ["BatchedMPC", "LinearMPC", "MPCError", "MPCSolution"]

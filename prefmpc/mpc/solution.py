@@ -1,0 +1,82 @@
+"""What every controller returns, and the error that a failed solve raises when called."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from prefmpc._checks import finite_array, shaped
+from prefmpc.models import QuadraticCost
+from prefmpc.systems import LinearSystem
+from prefmpc.trajectories import Trajectory
+
+
+class MPCError(RuntimeError):
+    """An MPC problem had no usable solution; ``solution`` holds the details."""
+
+    def __init__(self, solution: MPCSolution) -> None:
+        super().__init__(f"MPC problem {solution.status}: {solution.message}")
+        self.solution = solution
+
+
+@dataclasses.dataclass(frozen=True)
+class MPCSolution:
+    """Solution of one MPC problem, or of a batch of them.
+
+    Attributes
+    ----------
+    u : array (..., nu)
+        The input to apply now, u*_0; NaN unless the status is "solved".
+    trajectory : Trajectory
+        The predicted optimal trajectory T*, with ``horizon`` steps; NaN unless solved.
+    cost : array (...)
+        σ(T*); NaN unless solved.
+    status : str, or array of str (...)
+        "solved", "infeasible", "max_iterations" or "failed".
+    message : str
+        A sentence that says what the status means here.
+    iterations : int, or int array (...)
+    residual : float, or array (...)
+        How far from optimal: for `LinearMPC` the larger of the primal and dual residual, for
+        `BatchedMPC` a proven bound on the distance of the inputs from the optimal ones.
+    seconds : float
+        Wall time of the solve.
+    """
+
+    u: np.ndarray
+    trajectory: Trajectory
+    cost: Any
+    status: Any
+    message: str
+    iterations: Any
+    residual: Any
+    seconds: float
+
+    @property
+    def success(self) -> bool:
+        """Whether every problem was solved."""
+        return bool(np.all(np.asarray(self.status) == "solved"))
+
+
+def check_problem(system: Any, cost: Any) -> None:
+    """Raise a ValueError unless ``cost`` is a QuadraticCost that fits the LinearSystem."""
+    if not isinstance(system, LinearSystem):
+        raise ValueError(f"system must be a LinearSystem, got {type(system).__name__}")
+    if not isinstance(cost, QuadraticCost):
+        raise ValueError(f"cost must be a QuadraticCost, got {type(cost).__name__}")
+    sizes = (cost.Q.shape[-1], cost.R.shape[-1])
+    if sizes != (system.nx, system.nu):
+        raise ValueError(
+            f"cost must weigh {system.nx} states and {system.nu} inputs like the system, "
+            f"got {sizes[0]} and {sizes[1]}"
+        )
+    if not (np.isfinite(cost.theta_Q).all() and np.isfinite(cost.theta_R).all()):
+        raise ValueError("cost must have finite weights, got NaN or infinite ones")
+
+
+def check_state(x0: ArrayLike, nx: int) -> Any:
+    """Return x0 (..., nx) as a float64 array, or raise a ValueError that names it."""
+    return shaped("x0", finite_array("x0", x0), (nx,), "the system's states")

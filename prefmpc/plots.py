@@ -1,0 +1,146 @@
+"""The book's figures in one style: arrays in, a matplotlib figure out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import matplotlib as mpl
+import matplotlib.pyplot as plt
+import numpy as np
+from jax.typing import ArrayLike
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
+"""Okabe and Ito's palette, safe for the colour-blind, strongest contrasts first."""
+
+LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), "-")
+"""Line styles that go with `COLOURS`, so that a figure survives being printed in grey."""
+
+STYLE: dict[str, Any] = {
+    "figure.dpi": 110,
+    "savefig.facecolor": "white",
+    "figure.facecolor": "white",
+    "figure.constrained_layout.use": True,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#dddddd",
+    "grid.linewidth": 0.6,
+    "axes.titlesize": "medium",
+    "axes.titlelocation": "left",
+    "legend.frameon": False,
+    "lines.linewidth": 1.8,
+    "font.size": 10,
+    "axes.prop_cycle": mpl.cycler(color=list(COLOURS)) + mpl.cycler(linestyle=list(LINES)),
+}
+
+
+def use_style() -> None:
+    """Apply the book's style to all figures that follow."""
+    mpl.rcParams.update(STYLE)
+
+
+def responses(
+    responses: Mapping[str, ArrayLike],
+    dt: float,
+    *,
+    ylabel: str,
+    title: str = "",
+    ax: Axes | None = None,
+    step: bool = False,
+) -> Axes:
+    """Draw one signal over time, a line for each named response.
+
+    Parameters
+    ----------
+    responses : mapping of label to array (steps,)
+    dt : float
+        Sample time in seconds.
+    step : bool
+        Hold each value until the next sample, as inputs do.
+    """
+    if not responses:
+        raise ValueError("responses must hold at least one signal, got none")
+    ax = ax if ax is not None else plt.subplots(figsize=(6.4, 3.0))[1]
+    for label, values in responses.items():
+        values = np.asarray(values)
+        if values.ndim != 1:
+            raise ValueError(f"responses[{label!r}] must have shape (steps,), got {values.shape}")
+        time = dt * np.arange(values.size)
+        if step:
+            ax.step(time, values, where="post", label=label)
+        else:
+            ax.plot(time, values, label=label)
+    ax.axhline(0, color="#888888", linewidth=0.8, linestyle="-", zorder=0)
+    ax.set(xlabel="time in s", ylabel=ylabel, title=title)
+    if len(responses) > 1:
+        ax.legend(fontsize="small")
+    return ax
+
+
+def boxes(
+    values: Mapping[str, ArrayLike],
+    *,
+    ylabel: str,
+    title: str = "",
+    ax: Axes | None = None,
+    log: bool = False,
+    reference: float | None = None,
+) -> Axes:
+    """Draw one box for each named sample: quartiles, 5–95 % whiskers, outliers as dots.
+
+    Parameters
+    ----------
+    values : mapping of label to array (n,)
+    log : bool
+        Logarithmic vertical axis.
+    reference : float, optional
+        A horizontal line to compare with.
+    """
+    if not values:
+        raise ValueError("values must hold at least one sample, got none")
+    ax = ax if ax is not None else plt.subplots(figsize=(6.4, 3.2))[1]
+    drawn = ax.boxplot(
+        [np.asarray(v) for v in values.values()],
+        tick_labels=list(values),
+        whis=(5, 95),
+        widths=0.55,
+        patch_artist=True,
+        flierprops={"marker": ".", "markersize": 3, "markerfacecolor": "#666666"},
+        medianprops={"color": "#D55E00", "linewidth": 1.8},
+    )
+    for box in drawn["boxes"]:
+        box.set(facecolor="#cfe4f3", edgecolor="#0072B2")
+    if reference is not None:
+        ax.axhline(reference, color="#888888", linewidth=0.9, linestyle="--", zorder=0)
+    if log:
+        ax.set_yscale("log")
+    ax.set(ylabel=ylabel, title=title)
+    return ax
+
+
+def heatmaps(matrices: Mapping[str, ArrayLike], names: Sequence[str] = ()) -> Figure:
+    """Draw square matrices side by side on one colour scale, symmetric around zero.
+
+    Parameters
+    ----------
+    matrices : mapping of title to array (n, n)
+    names : labels of rows and columns.
+    """
+    if not matrices:
+        raise ValueError("matrices must hold at least one matrix, got none")
+    arrays = {title: np.asarray(matrix) for title, matrix in matrices.items()}
+    limit = max(float(np.abs(array).max()) for array in arrays.values())
+    figure, axes = plt.subplots(1, len(arrays), figsize=(3.1 * len(arrays) + 0.6, 3.0))
+    for ax, (title, array) in zip(np.atleast_1d(axes), arrays.items(), strict=True):
+        image = ax.imshow(array, cmap="RdBu_r", vmin=-limit, vmax=limit)
+        ax.set_title(title)
+        ax.grid(False)
+        ticks = range(len(array)) if names else []
+        ax.set_xticks(ticks, list(names))
+        ax.set_yticks(ticks, list(names))
+    figure.colorbar(image, ax=np.atleast_1d(axes).tolist(), shrink=0.85)
+    return figure

@@ -1,0 +1,67 @@
+"""Constraint sets: polyhedra over states, or over states and inputs together."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from prefmpc._checks import bounds_pair, finite_array
+
+
+@dataclasses.dataclass(frozen=True, eq=False, init=False)
+class Polyhedron:
+    """The set {z : H z ≤ h}.
+
+    As the constraint set Z of eq. (7d) of arXiv 2511.22502 z is the stacked vector (x, u); as the
+    terminal set X_N of eq. (7e) it is x alone.
+
+    Parameters
+    ----------
+    H : array (m, n)
+        One row a half-space, in the units of 1 / z times the unit of h.
+    h : array (m,)
+
+    Raises
+    ------
+    ValueError
+        If H or h hold NaN or infinite values, or their shapes do not fit.
+    """
+
+    H: np.ndarray
+    h: np.ndarray
+
+    def __init__(self, H: ArrayLike, h: ArrayLike) -> None:
+        H = np.asarray(finite_array("H", H, ndim=2))
+        h = np.asarray(finite_array("h", h, ndim=1))
+        if H.shape[0] != h.shape[0]:
+            raise ValueError(
+                f"H and h must have the same number of rows, got {H.shape} and {h.shape}"
+            )
+        if H.shape[1] == 0:
+            raise ValueError(f"H must have at least one column, got shape {H.shape}")
+        object.__setattr__(self, "H", H)
+        object.__setattr__(self, "h", h)
+
+    @property
+    def dim(self) -> int:
+        """Number of entries of z."""
+        return int(self.H.shape[1])
+
+    @classmethod
+    def box(cls, lower: ArrayLike, upper: ArrayLike) -> Polyhedron:
+        """Return {z : lower ≤ z ≤ upper}; infinite entries leave that side open."""
+        low = np.atleast_1d(finite_array("lower", lower, allow_inf=True))
+        low, high = bounds_pair(("lower", "upper"), low, upper, low.shape[-1])
+        eye = np.eye(low.size)
+        H = np.concatenate([eye[np.isfinite(high)], -eye[np.isfinite(low)]])
+        h = np.concatenate([high[np.isfinite(high)], -low[np.isfinite(low)]])
+        return cls(H, h)
+
+    def contains(self, z: ArrayLike, tol: float = 1e-9) -> np.ndarray:
+        """Say for each z (..., n) whether H z ≤ h + tol; a bool array (...)."""
+        z = np.asarray(finite_array("z", z))
+        if z.shape[-1:] != (self.dim,):
+            raise ValueError(f"z must have shape (..., {self.dim}), got {z.shape}")
+        return np.asarray((z @ self.H.T <= self.h + tol).all(axis=-1))

@@ -1,0 +1,211 @@
+"""The case studies of arXiv 2511.22502 as functions of a random key: one call, one draw.
+
+``python -m prefmpc.studies quadratic --draws 100`` repeats the first case study and writes the
+summary that the book reads.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from prefmpc.evaluation import accuracy, closed_loops
+from prefmpc.models import QuadraticCost
+from prefmpc.preferences import Comparisons, QuadraticPreference
+from prefmpc.systems import LinearSystem, oscillating_masses
+from prefmpc.training import FitResult, Selection, fit
+from prefmpc.trajectories import Trajectory, lqr_pool, phi, random_states
+
+RADIUS = np.array([0.3, 0.3, 0.3, 0.05, 0.05, 0.05])
+"""Half-widths of the uniform distribution of x(0): metres, then metres per second."""
+
+QUADRATIC_Q = np.diag([40.0, 40.0, 40.0, 5.0, 5.0, 5.0])
+QUADRATIC_R = np.diag([0.2, 0.2])
+QUADRATIC_HORIZON = 10
+SIZES = (20, 60, 100, 400, 1000)
+
+COLUMNS = ("train %", "test %", "time s", "mean φ", "max φ", "min φ")
+PAPER_TABLE_I: dict[str, tuple[float | None, ...]] = {
+    "From Π": (None, None, None, 1.000, 4.426, 0.054),
+    "Random": (None, 82.6, None, 1.833, 10.532, 0.106),
+    "σ₂₀": (100.0, 92.0, 1.13, 1.355, 5.491, 0.086),
+    "σ₆₀": (100.0, 94.8, 1.13, 1.108, 4.598, 0.059),
+    "σ₁₀₀": (98.0, 95.0, 1.16, 1.230, 5.192, 0.059),
+    "σ₄₀₀": (100.0, 99.4, 1.53, 1.043, 4.536, 0.057),
+    "σ₁₀₀₀": (100.0, 99.8, 1.87, 1.013, 4.404, 0.056),
+}
+ROWS = tuple(PAPER_TABLE_I)
+
+
+@dataclasses.dataclass(frozen=True)
+class QuadraticDraw:
+    """One draw of case study 1.
+
+    Attributes
+    ----------
+    system : LinearSystem
+    pool : Trajectory
+        The 50 training trajectories.
+    train : dict of int to Comparisons, by size
+    test : Comparisons
+        500 pairs.
+    fits : dict of int to FitResult, by size
+    phi : dict of str to array (200,)
+        φ₃₀ of each closed loop, by row of Table I, divided by the mean of the row "From Π".
+    loops : dict of str to Trajectory
+        The closed loops themselves, leading dimension 200.
+    table : array (7, 6)
+        Rows `ROWS`, columns `COLUMNS`; NaN where the paper has a dash.
+    """
+
+    system: LinearSystem
+    pool: Trajectory
+    train: dict[int, Comparisons]
+    test: Comparisons
+    fits: dict[int, FitResult]
+    phi: dict[str, np.ndarray]
+    loops: dict[str, Trajectory]
+    table: np.ndarray
+
+
+def quadratic_data(
+    *, key: Any, sizes: tuple[int, ...] = SIZES, shared_pool: bool = False
+) -> tuple[LinearSystem, Trajectory, dict[int, Comparisons], Comparisons]:
+    """Return the plant, the training pool, the training data by size, and the test data.
+
+    The paper does not say whether test pairs come from the 50 training trajectories
+    (``shared_pool``) or from others (default).
+    """
+    keys = jax.random.split(key, 3 + len(sizes))
+    system = oscillating_masses()
+    preference = QuadraticPreference(QUADRATIC_Q, QUADRATIC_R)
+
+    def make_pool(pool_key: Any) -> Trajectory:
+        return lqr_pool(system, 50, QUADRATIC_HORIZON, key=pool_key, radius=RADIUS)
+
+    pool = make_pool(keys[0])
+    test_pool = pool if shared_pool else make_pool(keys[1])
+    test = Comparisons.random(test_pool, preference, 500, key=keys[2])
+    train = {
+        n: Comparisons.random(pool, preference, n, key=k)
+        for n, k in zip(sizes, keys[3:], strict=True)
+    }
+    return system, pool, train, test
+
+
+def quadratic_case(
+    *,
+    key: Any,
+    selection: Selection = "leaky_test_accuracy",
+    restarts: int = 20,
+    tol: float = 1e-3,
+    shared_pool: bool = False,
+    loops: int = 200,
+    steps: int = 30,
+) -> QuadraticDraw:
+    """Run case study 1 once: data, five training sets, 200 closed loops for each controller."""
+    key_data, key_fit, key_states, key_random = jax.random.split(key, 4)
+    system, pool, train, test = quadratic_data(key=key_data, shared_pool=shared_pool)
+    fit_keys = jax.random.split(key_fit, len(SIZES))
+    leaked = test if selection == "leaky_test_accuracy" else None
+    fits = {
+        n: fit(train[n], key=k, restarts=restarts, selection=selection, test=leaked, tol=tol)
+        for n, k in zip(SIZES, fit_keys, strict=True)
+    }
+    true = QuadraticCost(QUADRATIC_Q, QUADRATIC_R)
+    learned = [true, *(fits[n].model for n in SIZES)]
+    stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *learned)
+    x0 = random_states(RADIUS, key=key_states, shape=(loops,))
+    many = closed_loops(system, stack, x0, horizon=QUADRATIC_HORIZON, steps=steps)
+    # Every simulation of the row "Random" has a controller of its own.
+    random = QuadraticCost.random(system.nx, system.nu, key=key_random, shape=(loops,))
+    each = closed_loops(system, random, x0[:, None], horizon=QUADRATIC_HORIZON, steps=steps)
+    if not (many.solved.all() and each.solved.all()):
+        raise RuntimeError("a closed loop met an MPC problem that was not solved")
+
+    names = ["From Π", *ROWS[2:]]
+    runs = {name: many.trajectories[i] for i, name in enumerate(names)}
+    runs["Random"] = each.trajectories[:, 0]
+    raw = {name: np.asarray(phi(runs[name], QUADRATIC_Q, QUADRATIC_R)) for name in ROWS}
+    performance = {name: values / raw["From Π"].mean() for name, values in raw.items()}
+
+    table = np.full((len(ROWS), len(COLUMNS)), np.nan)
+    for i, name in enumerate(ROWS):
+        values = performance[name]
+        table[i, 3:] = values.mean(), values.max(), values.min()
+    guesses = jax.vmap(lambda model: model(test.trajectories))(random)
+    table[1, 1] = 100 * np.mean([accuracy(lambda _, c=c: c, test) for c in guesses])
+    for i, n in enumerate(SIZES, start=2):
+        result = fits[n]
+        table[i, :3] = (
+            100 * accuracy(result.model, train[n]),
+            100 * accuracy(result.model, test),
+            result.seconds / restarts,
+        )
+    return QuadraticDraw(system, pool, train, test, fits, performance, runs, table)
+
+
+def quadratic_spread(draws: int, *, seed: int = 0, **options: Any) -> np.ndarray:
+    """Repeat `quadratic_case` with keys ``seed``, ``seed`` + 1, …; return tables (draws, 7, 6)."""
+    from tqdm import tqdm
+
+    tables = [
+        quadratic_case(key=jax.random.key(seed + i), **options).table
+        for i in tqdm(range(draws), desc="draws")
+    ]
+    return np.stack(tables)
+
+
+SPREADS: dict[str, dict[str, Any]] = {
+    "paper": {},
+    "validation": {"selection": "validation"},
+    "training loss": {"selection": "training_loss"},
+    "one start": {"selection": "training_loss", "restarts": 1},
+    "test pairs from the training pool": {"shared_pool": True},
+}
+"""Ways to run the case study that the book compares; "paper" is the paper's own."""
+
+
+def write_spread(path: Path, draws: int) -> None:
+    """Write the tables of all `SPREADS` to a JSON file, rounded to 4 digits, without the times.
+
+    Times belong to a machine, not to a draw; the book prints them where they are measured.
+    """
+    out: dict[str, Any] = {"rows": ROWS, "columns": COLUMNS, "seeds": list(range(draws))}
+    for name, options in SPREADS.items():
+        tables = quadratic_spread(draws, **options)
+        tables[:, :, COLUMNS.index("time s")] = np.nan
+        rounded = [[[None if np.isnan(v) else round(v, 4) for v in r] for r in t] for t in tables]
+        out[name] = rounded
+    temporary = path.with_suffix(".part")
+    temporary.write_text(json.dumps(out, ensure_ascii=False).replace("]], [[", "]],\n[[") + "\n")
+    os.replace(temporary, path)
+
+
+def read_spread(path: Path) -> dict[str, np.ndarray]:
+    """Read what `write_spread` wrote: tables (draws, 7, 6) by the names of `SPREADS`."""
+    stored = json.loads(path.read_text())
+    return {name: np.array(stored[name], dtype=np.float64) for name in SPREADS}
+
+
+def main() -> None:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("study", choices=["quadratic"])
+    parser.add_argument("--draws", type=int, default=100)
+    parser.add_argument("--out", type=Path, default=Path("book/case_studies/quadratic_spread.json"))
+    arguments = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    write_spread(arguments.out, arguments.draws)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,249 @@
+"""Plants: discrete-time linear systems with input bounds, and the book's benchmark plant."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy.linalg
+from jax.typing import ArrayLike
+
+from prefmpc._checks import bounds_pair, finite_array, psd_matrix
+from prefmpc._pytree import register_pytree
+
+if TYPE_CHECKING:
+    import control
+
+
+@dataclasses.dataclass(frozen=True, eq=False, init=False)
+class LinearSystem:
+    """The discrete-time plant x⁺ = A x + B u, y = C x with u_min ≤ u ≤ u_max.
+
+    Implements eq. (8) of arXiv 2511.22502.
+
+    Parameters
+    ----------
+    A : array (nx, nx)
+    B : array (nx, nu)
+    C : array (ny, nx), optional
+        Default: the identity, so that the output is the state.
+    dt : float
+        Sample time in seconds.
+    u_min, u_max : array (nu,) or float, optional
+        Input bounds in the unit of the input; None leaves that side open.
+
+    Raises
+    ------
+    ValueError
+        If a matrix holds NaN or its shape does not fit, if dt ≤ 0, or if the bounds cross.
+    """
+
+    A: np.ndarray
+    B: np.ndarray
+    C: np.ndarray
+    u_min: np.ndarray
+    u_max: np.ndarray
+    dt: float
+
+    def __init__(
+        self,
+        A: ArrayLike,
+        B: ArrayLike,
+        C: ArrayLike | None = None,
+        *,
+        dt: float,
+        u_min: ArrayLike | None = None,
+        u_max: ArrayLike | None = None,
+    ) -> None:
+        A, B, C = _state_space(A, B, C)
+        if not np.isfinite(dt) or dt <= 0:
+            raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
+        low, high = bounds_pair(("u_min", "u_max"), u_min, u_max, B.shape[1])
+        values = {"A": A, "B": B, "C": C, "u_min": low, "u_max": high, "dt": float(dt)}
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def nx(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[-1])
+
+    @property
+    def nu(self) -> int:
+        """Number of inputs."""
+        return int(self.B.shape[-1])
+
+    @property
+    def ny(self) -> int:
+        """Number of outputs."""
+        return int(self.C.shape[-2])
+
+    @classmethod
+    def from_continuous(
+        cls,
+        A: ArrayLike,
+        B: ArrayLike,
+        C: ArrayLike | None = None,
+        *,
+        dt: float,
+        u_min: ArrayLike | None = None,
+        u_max: ArrayLike | None = None,
+    ) -> LinearSystem:
+        """Discretise ẋ = A x + B u, y = C x exactly for inputs held constant over ``dt`` seconds.
+
+        The zero-order hold is one matrix exponential: exp([[A, B], [0, 0]]·dt) holds both
+        discrete matrices in its upper rows. Shapes, bounds and errors as in the constructor.
+        """
+        A, B, C = _state_space(A, B, C)
+        if not np.isfinite(dt) or dt <= 0:
+            raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
+        nx, nu = B.shape
+        block = np.zeros((nx + nu, nx + nu))
+        block[:nx, :nx], block[:nx, nx:] = A, B
+        held = scipy.linalg.expm(block * dt)
+        return cls(held[:nx, :nx], held[:nx, nx:], C, dt=dt, u_min=u_min, u_max=u_max)
+
+    @classmethod
+    def from_control(
+        cls,
+        system: control.StateSpace,
+        *,
+        dt: float | None = None,
+        u_min: ArrayLike | None = None,
+        u_max: ArrayLike | None = None,
+    ) -> LinearSystem:
+        """Take over a python-control state space.
+
+        A discrete one keeps its own sample time; a continuous one is discretised by zero-order
+        hold with ``dt`` in seconds. A feed-through D ≠ 0 is refused: outputs are y = C x here.
+        """
+        if np.any(np.asarray(system.D)):
+            raise ValueError(f"system must have D = 0 (the output is y = C x), got D = {system.D}")
+        if system.isctime(strict=True) or system.dt == 0:
+            if dt is None:
+                raise ValueError("dt must be given for a continuous-time system, got None")
+            return cls.from_continuous(
+                system.A, system.B, system.C, dt=dt, u_min=u_min, u_max=u_max
+            )
+        own = system.dt if isinstance(system.dt, float) else None
+        if own is None and dt is None:
+            raise ValueError(f"dt must be given: the system's own sample time is {system.dt!r}")
+        if own is not None and dt is not None and not np.isclose(own, dt):
+            raise ValueError(f"dt must equal the system's own sample time {own}, got {dt}")
+        chosen = own if own is not None else dt
+        assert chosen is not None
+        return cls(system.A, system.B, system.C, dt=chosen, u_min=u_min, u_max=u_max)
+
+    def to_control(self) -> control.StateSpace:
+        """Return the same plant as a python-control ``StateSpace`` (without the input bounds)."""
+        import control
+
+        return control.ss(self.A, self.B, self.C, np.zeros((self.ny, self.nu)), self.dt)
+
+    def lqr(self, Q: ArrayLike, R: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return the LQR gain K (nu, nx) of u = −K x and the cost-to-go matrix P (nx, nx).
+
+        Q (nx, nx) must be positive semidefinite, R (nu, nu) positive definite. Raises a
+        ValueError if the pair (A, B) cannot be stabilised, or if Q leaves an undamped mode
+        unseen, so that no stabilising solution exists.
+        """
+        Q = psd_matrix("Q", Q)
+        R = psd_matrix("R", R, definite=True)
+        if Q.shape != self.A.shape or R.shape != (self.nu, self.nu):
+            raise ValueError(
+                f"Q and R must have shapes {self.A.shape} and {(self.nu, self.nu)}, "
+                f"got {Q.shape} and {R.shape}"
+            )
+        mode = _unstabilisable_mode(self.A, self.B)
+        if mode is not None:
+            raise ValueError(
+                f"the pair (A, B) must be stabilisable, got a mode {mode:.4g} with "
+                f"|mode| = {abs(mode):.4g} that no input reaches"
+            )
+        try:
+            P = scipy.linalg.solve_discrete_are(self.A, self.B, Q, R)
+        except np.linalg.LinAlgError as error:
+            raise ValueError(f"Q must see every undamped mode of A: {error}") from None
+        K = np.linalg.solve(R + self.B.T @ P @ self.B, self.B.T @ P @ self.A)
+        radius = float(np.abs(np.linalg.eigvals(self.A - self.B @ K)).max())
+        if radius >= 1:
+            raise ValueError(
+                f"Q must see every undamped mode of A: the closed loop has radius {radius:.6g}"
+            )
+        return K, P
+
+
+register_pytree(LinearSystem, static=("dt",))
+
+
+def _state_space(A: ArrayLike, B: ArrayLike, C: ArrayLike | None) -> tuple[Any, Any, Any]:
+    A = np.asarray(finite_array("A", A, ndim=2))
+    B = np.asarray(finite_array("B", B, ndim=2))
+    if A.shape[0] != A.shape[1] or A.shape[0] == 0:
+        raise ValueError(f"A must be square (nx, nx), got shape {A.shape}")
+    nx = A.shape[0]
+    if B.shape[0] != nx or B.shape[1] == 0:
+        raise ValueError(f"B must have shape ({nx}, nu), got {B.shape}")
+    C = np.eye(nx) if C is None else np.asarray(finite_array("C", C, ndim=2))
+    if C.shape[1] != nx or C.shape[0] == 0:
+        raise ValueError(f"C must have shape (ny, {nx}), got {C.shape}")
+    return A, B, C
+
+
+def _unstabilisable_mode(A: np.ndarray, B: np.ndarray) -> complex | None:
+    """Return an eigenvalue on or outside the unit circle that fails the Hautus test, if any."""
+    nx = A.shape[0]
+    scale = max(float(np.linalg.norm(A, 2)), float(np.linalg.norm(B, 2)), 1.0)
+    for mode in np.linalg.eigvals(A):
+        if abs(mode) < 1 - 1e-12:
+            continue
+        pencil = np.concatenate([A - mode * np.eye(nx), B], axis=1)
+        if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-10 * scale:
+            return complex(mode)
+    return None
+
+
+def oscillating_masses(
+    masses: ArrayLike = (1.0, 0.5, 1.0),
+    stiffness: ArrayLike = 2.0,
+    *,
+    dt: float = 0.2,
+    u_max: float = 1.0,
+) -> LinearSystem:
+    """Return the book's plant: masses on a line between two walls, joined by springs.
+
+    Forces act on the first and the last mass; there is no damping. The state is
+    (positions, velocities), the output the positions. With the defaults this is the plant of both
+    case studies of arXiv 2511.22502, section III.
+
+    Parameters
+    ----------
+    masses : array (n,)
+        In kg, n ≥ 2.
+    stiffness : float or array (n + 1,)
+        Spring constants in N/m, wall to wall.
+    dt : float
+        Sample time in s.
+    u_max : float
+        Largest force in N: |u| ≤ u_max. ``np.inf`` leaves the force unbounded.
+
+    Raises
+    ------
+    ValueError
+        If fewer than two masses are given, a mass is not positive or a spring is negative.
+    """
+    m = np.asarray(finite_array("masses", masses, ndim=1))
+    n = m.size
+    if n < 2 or (m <= 0).any():
+        raise ValueError(f"masses must be at least two positive numbers in kg, got {m}")
+    k = np.asarray(finite_array("stiffness", stiffness))
+    if k.shape not in ((), (n + 1,)) or (k < 0).any():
+        raise ValueError(f"stiffness must be one or {n + 1} nonnegative numbers in N/m, got {k}")
+    k = np.broadcast_to(k, (n + 1,))
+    springs = np.diag(k[:-1] + k[1:]) - np.diag(k[1:-1], 1) - np.diag(k[1:-1], -1)
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-springs / m[:, None], np.zeros((n, n))]])
+    B = np.zeros((2 * n, 2))
+    B[n, 0], B[-1, 1] = 1 / m[0], 1 / m[-1]
+    C = np.eye(n, 2 * n)
+    return LinearSystem.from_continuous(A, B, C, dt=dt, u_min=-u_max, u_max=u_max)

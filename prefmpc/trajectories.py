@@ -1,0 +1,262 @@
+"""Trajectories T = (X, U, Y): the container, the quadratic cost φ, rollouts and random pools."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from prefmpc._checks import finite_array, nonnegative, positive_int, psd_matrix, shaped
+from prefmpc._pytree import bypass_init, register_pytree
+from prefmpc.systems import LinearSystem
+
+
+@dataclasses.dataclass(frozen=True, eq=False, init=False)
+class Trajectory:
+    """One trajectory, or a batch of them: x_0 … x_N, u_0 … u_{N−1}, y_0 … y_{N−1}.
+
+    Time stands before the channel and batches lead. Below eq. (1) of arXiv 2511.22502.
+
+    Parameters
+    ----------
+    x : array (..., N + 1, nx)
+        States.
+    u : array (..., N, nu)
+        Inputs.
+    y : array (..., N, ny), optional
+        Outputs. Default: the states x_0 … x_{N−1}.
+
+    Raises
+    ------
+    ValueError
+        If an array holds NaN or infinite values, or the shapes do not fit each other.
+    """
+
+    x: Any
+    u: Any
+    y: Any
+
+    def __init__(self, x: ArrayLike, u: ArrayLike, y: ArrayLike | None = None) -> None:
+        x = shaped("x", finite_array("x", x), (None, None), "time, then states")
+        u = shaped("u", finite_array("u", u), (None, None), "time, then inputs")
+        horizon = u.shape[-2]
+        if horizon < 1:
+            raise ValueError(f"u must hold at least one step, got shape {u.shape}")
+        if x.shape[-2] != horizon + 1:
+            raise ValueError(
+                f"x must hold one step more than u (x_0 … x_N against u_0 … u_{{N−1}}), "
+                f"got {x.shape[-2]} states for {horizon} inputs"
+            )
+        y = x[..., :-1, :] if y is None else finite_array("y", y)
+        shaped("y", y, (horizon, None), "one output for each input")
+        if not x.shape[:-2] == u.shape[:-2] == y.shape[:-2]:
+            raise ValueError(
+                "x, u and y must have the same leading batch shape, "
+                f"got {x.shape[:-2]}, {u.shape[:-2]} and {y.shape[:-2]}"
+            )
+        for name, value in {"x": x, "u": u, "y": y}.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def horizon(self) -> int:
+        """Number of steps N."""
+        return int(self.u.shape[-2])
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading shape; () for a single trajectory."""
+        return tuple(self.u.shape[:-2])
+
+    def __getitem__(self, index: Any) -> Trajectory:
+        """Index the leading batch dimensions."""
+        if not self.batch_shape:
+            raise IndexError("a single trajectory has no batch dimension to index")
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+    def __len__(self) -> int:
+        """Size of the leading batch dimension."""
+        if not self.batch_shape:
+            raise TypeError("a single trajectory has no length; its number of steps is .horizon")
+        return self.batch_shape[0]
+
+
+register_pytree(Trajectory)
+
+
+class Moments(NamedTuple):
+    """Second moments S_x = Σ_k x_k x_kᵀ (..., nx, nx) and S_u = Σ_k u_k u_kᵀ (..., nu, nu)."""
+
+    Sx: Any
+    Su: Any
+
+
+def second_moments(trajectory: Trajectory) -> Moments:
+    """Return Σ_k x_k x_kᵀ and Σ_k u_k u_kᵀ over k = 0 … N−1.
+
+    All that a quadratic cost can see of a trajectory: φ_N = ⟨Q, S_x⟩ + ⟨R, S_u⟩. The final state
+    x_N is left out, as in eq. (10) of arXiv 2511.22502.
+    """
+    x = trajectory.x[..., :-1, :]
+    u = trajectory.u
+    return Moments(jnp.einsum("...ki,...kj->...ij", x, x), jnp.einsum("...ki,...kj->...ij", u, u))
+
+
+def phi(trajectory: Trajectory, Q: ArrayLike, R: ArrayLike) -> Any:
+    """Return φ_N(T; Q, R) = Σ_{k=0}^{N−1} x_kᵀ Q x_k + u_kᵀ R u_k, shape (...).
+
+    Implements eq. (10) of arXiv 2511.22502. Q (nx, nx) and R (nu, nu) must be positive
+    semidefinite; anything else raises a ValueError.
+    """
+    Q, R = psd_matrix("Q", Q), psd_matrix("R", R)
+    shaped("Q", Q, (trajectory.x.shape[-1],) * 2, "the trajectory's states")
+    shaped("R", R, (trajectory.u.shape[-1],) * 2, "the trajectory's inputs")
+    x, u = trajectory.x[..., :-1, :], trajectory.u
+    return jnp.einsum("...ki,ij,...kj->...", x, Q, x) + jnp.einsum("...ki,ij,...kj->...", u, R, u)
+
+
+def rollout(
+    system: LinearSystem,
+    x0: ArrayLike,
+    law: Callable[[Any], Any] | ArrayLike,
+    steps: int,
+) -> Trajectory:
+    """Run the plant for ``steps`` steps under a feedback law, for a whole batch of x(0) at once.
+
+    The input bounds of ``system`` are not applied: a law that must respect them does so itself.
+
+    Parameters
+    ----------
+    x0 : array (..., nx)
+    law : callable or array (..., nu, nx)
+        A JAX function x (nx,) → u (nu,), or a gain K for u = −K x, one for all or one for each
+        x(0).
+    steps : int
+
+    Returns
+    -------
+    Trajectory
+        x (..., steps + 1, nx), u (..., steps, nu), y (..., steps, ny).
+
+    Raises
+    ------
+    ValueError
+        If x0 holds NaN, a shape does not fit, or ``steps`` is below 1.
+    """
+    x0 = shaped("x0", finite_array("x0", x0), (system.nx,), "the system's states")
+    steps = positive_int("steps", steps)
+    batch = x0.shape[:-1]
+    flat = jnp.asarray(x0).reshape(-1, system.nx)
+    if callable(law):
+        x, u = _rollout_law(system.A, system.B, flat, steps, law)
+    else:
+        K = shaped("law", finite_array("law", law), (system.nu, system.nx), "a gain K")
+        gains = jnp.broadcast_to(K, (*batch, system.nu, system.nx))
+        x, u = _rollout_gain(
+            system.A, system.B, flat, steps, gains.reshape(-1, system.nu, system.nx)
+        )
+    x = x.reshape(*batch, steps + 1, system.nx)
+    u = u.reshape(*batch, steps, system.nu)
+    return bypass_init(Trajectory, x=x, u=u, y=x[..., :-1, :] @ system.C.T)
+
+
+def _scan(A: Any, B: Any, x0: Any, steps: int, law: Callable[[Any], Any]) -> tuple[Any, Any]:
+    def step(x: Any, _: None) -> tuple[Any, tuple[Any, Any]]:
+        u = law(x)
+        x_next = A @ x + B @ u
+        return x_next, (x_next, u)
+
+    _, (x, u) = jax.lax.scan(step, x0, None, length=steps)
+    return jnp.concatenate([x0[None], x]), u
+
+
+@jax.jit(static_argnums=(3, 4))
+def _rollout_law(A: Any, B: Any, x0: Any, steps: int, law: Callable[[Any], Any]) -> Any:
+    return jax.vmap(lambda start: _scan(A, B, start, steps, law))(x0)
+
+
+@jax.jit(static_argnums=3)
+def _rollout_gain(A: Any, B: Any, x0: Any, steps: int, K: Any) -> Any:
+    return jax.vmap(lambda start, gain: _scan(A, B, start, steps, lambda x: -gain @ x))(x0, K)
+
+
+def random_weights(
+    nx: int,
+    nu: int,
+    *,
+    key: Any,
+    shape: tuple[int, ...] = (),
+    low: float = 0.1,
+    high: float = 10.0,
+    coupling: float = 0.1,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw predominantly diagonal weights Q (*shape, nx, nx) and R (*shape, nu, nu).
+
+    Each is MᵀM/2 + diag(U[low, high]) with M = ``coupling`` · standard normal. The paper (section
+    III-A) says "predominantly diagonal, with diagonal elements in [0.1, 10]" and no more; this
+    reading gives its row "Random" of Table I.
+    """
+    nx, nu = positive_int("nx", nx), positive_int("nu", nu)
+    if not 0 < nonnegative("low", low) < nonnegative("high", high):
+        raise ValueError(f"low and high must satisfy 0 < low < high, got {low} and {high}")
+    nonnegative("coupling", coupling)
+    keys = jax.random.split(key, 4)
+
+    def draw(key_square: Any, key_diagonal: Any, n: int) -> np.ndarray:
+        M = coupling * np.asarray(jax.random.normal(key_square, (*shape, n, n)))
+        d = np.asarray(jax.random.uniform(key_diagonal, (*shape, n), minval=low, maxval=high))
+        return np.swapaxes(M, -1, -2) @ M / 2 + d[..., None] * np.eye(n)
+
+    return draw(keys[0], keys[1], nx), draw(keys[2], keys[3], nu)
+
+
+def random_states(radius: ArrayLike, *, key: Any, shape: tuple[int, ...] = ()) -> np.ndarray:
+    """Draw states (*shape, nx), each entry uniform in [−radius, radius]; ``radius`` is (nx,)."""
+    radius = np.asarray(finite_array("radius", radius, ndim=1))
+    if (radius < 0).any():
+        raise ValueError(f"radius must not be negative, got {radius}")
+    unit = jax.random.uniform(key, (*shape, radius.size), minval=-1.0, maxval=1.0)
+    return np.asarray(unit) * radius
+
+
+def lqr_pool(
+    system: LinearSystem,
+    size: int,
+    steps: int,
+    *,
+    key: Any,
+    radius: ArrayLike,
+    weights: tuple[ArrayLike, ArrayLike] | None = None,
+) -> Trajectory:
+    """Simulate ``size`` closed loops, each with its own random x(0) and its own random LQR.
+
+    This is how the paper (section III-A) makes the trajectories that people compare.
+
+    Parameters
+    ----------
+    radius : array (nx,)
+        x(0) is uniform in [−radius, radius].
+    weights : (Q, R), optional
+        Stacks (size, nx, nx) and (size, nu, nu) of LQR weights; default: `random_weights`.
+
+    Returns
+    -------
+    Trajectory
+        With leading dimension ``size``.
+    """
+    size = positive_int("size", size)
+    key_weights, key_states = jax.random.split(key)
+    if weights is None:
+        Q, R = random_weights(system.nx, system.nu, key=key_weights, shape=(size,))
+    else:
+        Q = np.asarray(finite_array("weights[0]", weights[0], ndim=3))
+        R = np.asarray(finite_array("weights[1]", weights[1], ndim=3))
+        if len(Q) != size or len(R) != size:
+            raise ValueError(f"weights must hold {size} matrices each, got {len(Q)} and {len(R)}")
+    gains = np.stack([system.lqr(q, r)[0] for q, r in zip(Q, R, strict=True)])
+    x0 = random_states(radius, key=key_states, shape=(size,))
+    return rollout(system, x0, gains, steps)
