@@ -29,7 +29,9 @@ CHANGING = {
     "a timing": re.compile(r"Wall time|CPU times|per loop|\belapsed\b", re.IGNORECASE),
     "a progress bar": re.compile(r"\d+%\|| ?\d+it/s|\r(?!\n)"),
     "a traceback": re.compile(r"Traceback \(most recent call last\)"),
-    "a path of this machine": re.compile(r"(?<![\w.])/(?:home|root|tmp|usr|opt|work|Users)/\w"),
+    "a path of this machine": re.compile(
+        rf"(?<![\w.])/(?:home|root|tmp|usr|opt|Users)/\w|{re.escape(str(ROOT))}\b"
+    ),
 }
 
 
