@@ -24,9 +24,7 @@ def is_traced(value: Any) -> bool:
     return isinstance(value, jax.core.Tracer)
 
 
-def finite_array(
-    name: str, value: ArrayLike, ndim: int | None = None, *, allow_inf: bool = False
-) -> Any:
+def finite_array(name: str, value: Any, ndim: int | None = None, *, allow_inf: bool = False) -> Any:
     """Return ``value`` as a float64 array; raise a ValueError if it cannot be one or has NaN.
 
     ``ndim`` is the exact number of dimensions wanted (None: any). NumPy stays NumPy, JAX stays

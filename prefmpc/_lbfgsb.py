@@ -22,7 +22,7 @@ def minimise(
     start: Any,
     bounds: tuple[Any, Any],
     *,
-    l1: Any | None = None,
+    l1: Any = None,
     max_iterations: Any,
     tol: Any,
 ) -> tuple[Any, Any, Any]:

@@ -8,6 +8,7 @@ from typing import Any
 import matplotlib as mpl
 import matplotlib.pyplot as plt
 import numpy as np
+from cycler import cycler
 from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -18,7 +19,7 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#0
 LINES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)), "-")
 """Line styles that go with `COLOURS`, so that a figure survives being printed in grey."""
 
-STYLE: dict[str, Any] = {
+STYLE: dict[Any, Any] = {
     "figure.dpi": 110,
     "savefig.facecolor": "white",
     "figure.facecolor": "white",
@@ -34,7 +35,7 @@ STYLE: dict[str, Any] = {
     "legend.frameon": False,
     "lines.linewidth": 1.8,
     "font.size": 10,
-    "axes.prop_cycle": mpl.cycler(color=list(COLOURS)) + mpl.cycler(linestyle=list(LINES)),
+    "axes.prop_cycle": cycler(color=list(COLOURS)) + cycler(linestyle=list(LINES)),
 }
 
 

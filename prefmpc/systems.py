@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -56,11 +57,11 @@ class LinearSystem:
         u_min: ArrayLike | None = None,
         u_max: ArrayLike | None = None,
     ) -> None:
-        A, B, C = _state_space(A, B, C)
+        a, b, c = _state_space(A, B, C)
         if not np.isfinite(dt) or dt <= 0:
             raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
-        low, high = bounds_pair(("u_min", "u_max"), u_min, u_max, B.shape[1])
-        values = {"A": A, "B": B, "C": C, "u_min": low, "u_max": high, "dt": float(dt)}
+        low, high = bounds_pair(("u_min", "u_max"), u_min, u_max, b.shape[1])
+        values = {"A": a, "B": b, "C": c, "u_min": low, "u_max": high, "dt": float(dt)}
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -95,14 +96,14 @@ class LinearSystem:
         The zero-order hold is one matrix exponential: exp([[A, B], [0, 0]]·dt) holds both
         discrete matrices in its upper rows. Shapes, bounds and errors as in the constructor.
         """
-        A, B, C = _state_space(A, B, C)
+        a, b, c = _state_space(A, B, C)
         if not np.isfinite(dt) or dt <= 0:
             raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
-        nx, nu = B.shape
+        nx, nu = b.shape
         block = np.zeros((nx + nu, nx + nu))
-        block[:nx, :nx], block[:nx, nx:] = A, B
+        block[:nx, :nx], block[:nx, nx:] = a, b
         held = scipy.linalg.expm(block * dt)
-        return cls(held[:nx, :nx], held[:nx, nx:], C, dt=dt, u_min=u_min, u_max=u_max)
+        return cls(held[:nx, :nx], held[:nx, nx:], c, dt=dt, u_min=u_min, u_max=u_max)
 
     @classmethod
     def from_control(
@@ -126,7 +127,8 @@ class LinearSystem:
             return cls.from_continuous(
                 system.A, system.B, system.C, dt=dt, u_min=u_min, u_max=u_max
             )
-        own = system.dt if isinstance(system.dt, float) else None
+        unknown = system.dt is None or system.dt is True
+        own = None if unknown else float(system.dt)
         if own is None and dt is None:
             raise ValueError(f"dt must be given: the system's own sample time is {system.dt!r}")
         if own is not None and dt is not None and not np.isclose(own, dt):
@@ -205,8 +207,8 @@ def _unstabilisable_mode(A: np.ndarray, B: np.ndarray) -> complex | None:
 
 
 def oscillating_masses(
-    masses: ArrayLike = (1.0, 0.5, 1.0),
-    stiffness: ArrayLike = 2.0,
+    masses: ArrayLike | Sequence[float] = (1.0, 0.5, 1.0),
+    stiffness: ArrayLike | Sequence[float] = 2.0,
     *,
     dt: float = 0.2,
     u_max: float = 1.0,

@@ -206,7 +206,7 @@ def fit(
 
     n = len(comparisons)
     data = pair_data(starts, comparisons, _padded_size(n))
-    held_out = None
+    held_out = np.zeros(0, dtype=int)
     if selection == "validation":
         order = np.asarray(jax.random.permutation(key_split, n))
         held_out = order[: max(1, round(validation_fraction * n))]

@@ -42,24 +42,25 @@ class Trajectory:
     y: Any
 
     def __init__(self, x: ArrayLike, u: ArrayLike, y: ArrayLike | None = None) -> None:
-        x = shaped("x", finite_array("x", x), (None, None), "time, then states")
-        u = shaped("u", finite_array("u", u), (None, None), "time, then inputs")
-        horizon = u.shape[-2]
+        states = shaped("x", finite_array("x", x), (None, None), "time, then states")
+        inputs = shaped("u", finite_array("u", u), (None, None), "time, then inputs")
+        horizon = inputs.shape[-2]
         if horizon < 1:
-            raise ValueError(f"u must hold at least one step, got shape {u.shape}")
-        if x.shape[-2] != horizon + 1:
+            raise ValueError(f"u must hold at least one step, got shape {inputs.shape}")
+        if states.shape[-2] != horizon + 1:
             raise ValueError(
                 f"x must hold one step more than u (x_0 … x_N against u_0 … u_{{N−1}}), "
-                f"got {x.shape[-2]} states for {horizon} inputs"
+                f"got {states.shape[-2]} states for {horizon} inputs"
             )
-        y = x[..., :-1, :] if y is None else finite_array("y", y)
-        shaped("y", y, (horizon, None), "one output for each input")
-        if not x.shape[:-2] == u.shape[:-2] == y.shape[:-2]:
+        outputs = states[..., :-1, :] if y is None else finite_array("y", y)
+        shaped("y", outputs, (horizon, None), "one output for each input")
+        batches = [array.shape[:-2] for array in (states, inputs, outputs)]
+        if not batches[0] == batches[1] == batches[2]:
             raise ValueError(
                 "x, u and y must have the same leading batch shape, "
-                f"got {x.shape[:-2]}, {u.shape[:-2]} and {y.shape[:-2]}"
+                f"got {batches[0]}, {batches[1]} and {batches[2]}"
             )
-        for name, value in {"x": x, "u": u, "y": y}.items():
+        for name, value in {"x": states, "u": inputs, "y": outputs}.items():
             object.__setattr__(self, name, value)
 
     @property
@@ -147,10 +148,10 @@ def rollout(
     ValueError
         If x0 holds NaN, a shape does not fit, or ``steps`` is below 1.
     """
-    x0 = shaped("x0", finite_array("x0", x0), (system.nx,), "the system's states")
+    starts = shaped("x0", finite_array("x0", x0), (system.nx,), "the system's states")
     steps = positive_int("steps", steps)
-    batch = x0.shape[:-1]
-    flat = jnp.asarray(x0).reshape(-1, system.nx)
+    batch = starts.shape[:-1]
+    flat = jnp.asarray(starts).reshape(-1, system.nx)
     if callable(law):
         x, u = _rollout_law(system.A, system.B, flat, steps, law)
     else:
