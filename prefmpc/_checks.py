@@ -31,6 +31,8 @@ def finite_array(name: str, value: Any, ndim: int | None = None, *, allow_inf: b
     JAX. Tracers pass through: only their shape can be checked.
     """
     require_x64()
+    if np.iscomplexobj(value):
+        raise ValueError(f"{name} must be an array of real numbers, got complex ones")
     if isinstance(value, jax.Array):
         array: Any = value if value.dtype == jnp.float64 else value.astype(jnp.float64)
     else:
@@ -50,6 +52,12 @@ def finite_array(name: str, value: Any, ndim: int | None = None, *, allow_inf: b
                 f"{name} {wish}, got {int(bad.sum())} bad value(s), the first at index {where}"
             )
     return array
+
+
+def instance(name: str, value: Any, wanted: type) -> None:
+    """Raise a ValueError unless ``value`` is an instance of ``wanted``."""
+    if not isinstance(value, wanted):
+        raise ValueError(f"{name} must be a {wanted.__name__}, got {type(value).__name__}")
 
 
 def shaped(name: str, array: Any, shape: tuple[int | None, ...], meaning: str = "") -> Any:

@@ -1,6 +1,6 @@
 """The case studies of arXiv 2511.22502 as functions of a random key: one call, one draw.
 
-``python -m prefmpc.studies quadratic --draws 100`` repeats the first case study and writes the
+``python -m prefmpc.studies quadratic --draws 50`` repeats the first case study and writes the
 summary that the book reads.
 """
 
@@ -22,7 +22,7 @@ from prefmpc.evaluation import accuracy, closed_loops
 from prefmpc.models import QuadraticCost
 from prefmpc.preferences import Comparisons, QuadraticPreference
 from prefmpc.systems import LinearSystem, oscillating_masses
-from prefmpc.training import FitResult, Selection, fit
+from prefmpc.training import FitResult, Selection, best_restart, fit
 from prefmpc.trajectories import Trajectory, lqr_pool, phi, random_states
 
 RADIUS = np.array([0.3, 0.3, 0.3, 0.05, 0.05, 0.05])
@@ -102,6 +102,12 @@ def quadratic_data(
     return system, pool, train, test
 
 
+def error_rates(models: QuadraticCost, comparisons: Comparisons) -> np.ndarray:
+    """Return 1 − accuracy on ``comparisons`` for every model of a stack (c,)."""
+    costs = np.asarray(jax.vmap(lambda model: model(comparisons.trajectories))(models))
+    return np.array([1 - accuracy(lambda _, row=row: row, comparisons) for row in costs])
+
+
 def quadratic_case(
     *,
     key: Any,
@@ -159,54 +165,90 @@ def _given(costs: Any, _: Trajectory) -> Any:
     return costs
 
 
-def quadratic_spread(draws: int, *, seed: int = 0, **options: Any) -> np.ndarray:
-    """Repeat `quadratic_case` with keys ``seed``, ``seed`` + 1, …; return tables (draws, 7, 6)."""
-    from tqdm import tqdm
+VARIANTS = (
+    "paper",
+    "validation split",
+    "training loss",
+    "one start",
+    "test pairs from the training pool",
+)
+"""Ways to choose the model that the book compares; "paper" is the paper's own."""
 
-    tables = [
-        quadratic_case(key=jax.random.key(seed + i), **options).table
-        for i in tqdm(range(draws), desc="draws")
-    ]
-    return np.stack(tables)
 
+def quadratic_variants(*, key: Any, restarts: int = 20, loops: int = 200) -> np.ndarray:
+    """Run case study 1 for one key with every way of choosing among the restarts.
 
-SPREADS: dict[str, dict[str, Any]] = {
-    "paper": {},
-    "validation": {"selection": "validation"},
-    "training loss": {"selection": "training_loss"},
-    "one start": {"selection": "training_loss", "restarts": 1},
-    "test pairs from the training pool": {"shared_pool": True},
-}
-"""Ways to run the case study that the book compares; "paper" is the paper's own."""
+    Returns tables (variants, 7, 6) in the order of `VARIANTS`, columns as in `QuadraticDraw`
+    without the times (NaN): those belong to a machine, not to a draw. The first one is the table
+    of `quadratic_case` for the same key. Trains each set of starts once on all pairs and once on
+    the pairs left by the validation split.
+    """
+    case = quadratic_case(key=key, restarts=restarts, loops=loops)
+    key_data, key_fit, key_states, _ = jax.random.split(key, 4)
+    _, _, _, inner = quadratic_data(key=key_data, shared_pool=True)
+    chosen: dict[str, list[Any]] = {name: [] for name in VARIANTS}
+    for n, k in zip(SIZES, jax.random.split(key_fit, len(SIZES)), strict=True):
+        result = case.fits[n]
+        for name, score in {
+            "training loss": result.training_loss,
+            "one start": np.arange(restarts),
+            "test pairs from the training pool": error_rates(result.models, inner),
+        }.items():
+            index = best_restart(score, result.status, result.training_loss)
+            chosen[name].append(jax.tree.map(lambda leaf, i=index: leaf[i], result.models))
+        chosen["paper"].append(result.model)
+        held_out = fit(case.train[n], key=k, restarts=restarts, selection="validation")
+        chosen["validation split"].append(held_out.model)
+
+    tables = np.repeat(case.table[None], len(VARIANTS), axis=0)
+    tables[:, :, COLUMNS.index("time s")] = np.nan
+    x0 = random_states(RADIUS, key=key_states, shape=(loops,))
+    everyone = [model for name in VARIANTS for model in chosen[name]]
+    stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *everyone)
+    runs = closed_loops(case.system, stack, x0, horizon=QUADRATIC_HORIZON, steps=30)
+    if not runs.solved.all():
+        raise RuntimeError("a closed loop met an MPC problem that was not solved")
+    best = np.asarray(phi(case.loops["From Π"], QUADRATIC_Q, QUADRATIC_R)).mean()
+    values = np.asarray(phi(runs.trajectories, QUADRATIC_Q, QUADRATIC_R)) / best
+    values = values.reshape(len(VARIANTS), len(SIZES), loops)
+    tables[:, 2:, 3:] = np.stack([values.mean(-1), values.max(-1), values.min(-1)], axis=-1)
+    for v, name in enumerate(VARIANTS):
+        test = inner if name == VARIANTS[-1] else case.test
+        for i, n in enumerate(SIZES):
+            tables[v, 2 + i, 0] = 100 * accuracy(chosen[name][i], case.train[n])
+            tables[v, 2 + i, 1] = 100 * accuracy(chosen[name][i], test)
+    return tables
 
 
 def write_spread(path: Path, draws: int) -> None:
-    """Write the tables of all `SPREADS` to a JSON file, rounded to 4 digits, without the times.
+    """Write the tables of seeds 0 … ``draws`` − 1 to a JSON file, rounded to 4 digits."""
+    from tqdm import tqdm
 
-    Times belong to a machine, not to a draw; the book prints them where they are measured.
-    """
-    out: dict[str, Any] = {"rows": ROWS, "columns": COLUMNS, "seeds": list(range(draws))}
-    for name, options in SPREADS.items():
-        tables = quadratic_spread(draws, **options)
-        tables[:, :, COLUMNS.index("time s")] = np.nan
-        rounded = [[[None if np.isnan(v) else round(v, 4) for v in r] for r in t] for t in tables]
-        out[name] = rounded
+    tables = [
+        quadratic_variants(key=jax.random.key(seed)) for seed in tqdm(range(draws), desc="draws")
+    ]
+    rounded = [
+        [[[None if np.isnan(v) else round(v, 4) for v in row] for row in t] for t in draw]
+        for draw in np.stack(tables)
+    ]
+    head = {"variants": VARIANTS, "rows": ROWS, "columns": COLUMNS, "seeds": list(range(draws))}
+    text = json.dumps({**head, "tables": rounded}, ensure_ascii=False)
     temporary = path.with_suffix(".part")
-    temporary.write_text(json.dumps(out, ensure_ascii=False).replace("]], [[", "]],\n[[") + "\n")
+    temporary.write_text(text.replace("]], [[", "]],\n[[") + "\n", encoding="utf-8")
     os.replace(temporary, path)
 
 
 def read_spread(path: Path) -> dict[str, np.ndarray]:
-    """Read what `write_spread` wrote: tables (draws, 7, 6) by the names of `SPREADS`."""
-    stored = json.loads(path.read_text())
-    return {name: np.array(stored[name], dtype=np.float64) for name in SPREADS}
+    """Read what `write_spread` wrote: tables (draws, 7, 6) by the names of `VARIANTS`."""
+    tables = np.array(json.loads(path.read_text(encoding="utf-8"))["tables"], dtype=np.float64)
+    return {name: tables[:, i] for i, name in enumerate(VARIANTS)}
 
 
 def main() -> None:
     """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("study", choices=["quadratic"])
-    parser.add_argument("--draws", type=int, default=100)
+    parser.add_argument("--draws", type=int, default=50)
     parser.add_argument("--out", type=Path, default=Path("book/case_studies/quadratic_spread.json"))
     arguments = parser.parse_args()
     jax.config.update("jax_enable_x64", True)

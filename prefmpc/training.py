@@ -234,12 +234,9 @@ def fit(
     else:
         assert test is not None
         score = _scores(models, test, "errors")
-    usable = status == "converged"
-    # Equal scores (accuracies often are) are decided by the loss on the training pairs.
-    ranking = np.lexsort((loss, np.where(usable, score, np.inf)))
     result = FitResult(
         models=jax.tree.map(jnp.asarray, models),
-        chosen=int(ranking[0]) if usable.any() else None,
+        chosen=best_restart(score, status, loss),
         selection=selection,
         selection_score=score,
         status=status,
@@ -253,6 +250,16 @@ def fit(
     if not result.success:
         warnings.warn(f"fit: {result.message}", RuntimeWarning, stacklevel=2)
     return result
+
+
+def best_restart(score: Any, status: np.ndarray, loss: np.ndarray) -> int | None:
+    """Return the converged restart with the smallest score; equal scores are decided by the loss.
+
+    None if no restart converged to finite weights within the bounds.
+    """
+    usable = status == "converged"
+    ranking = np.lexsort((loss, np.where(usable, score, np.inf)))
+    return int(ranking[0]) if usable.any() else None
 
 
 @jax.jit(static_argnums=(3, 4))

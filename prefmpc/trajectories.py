@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, nonnegative, positive_int, psd_matrix, shaped
+from prefmpc._checks import finite_array, instance, nonnegative, positive_int, psd_matrix, shaped
 from prefmpc._pytree import bypass_init, register_pytree
 from prefmpc.systems import LinearSystem
 
@@ -102,6 +102,7 @@ def second_moments(trajectory: Trajectory) -> Moments:
     All that a quadratic cost can see of a trajectory: φ_N = ⟨Q, S_x⟩ + ⟨R, S_u⟩. The final state
     x_N is left out, as in eq. (10) of arXiv 2511.22502.
     """
+    instance("trajectory", trajectory, Trajectory)
     x = trajectory.x[..., :-1, :]
     u = trajectory.u
     return Moments(jnp.einsum("...ki,...kj->...ij", x, x), jnp.einsum("...ki,...kj->...ij", u, u))
@@ -113,6 +114,7 @@ def phi(trajectory: Trajectory, Q: ArrayLike, R: ArrayLike) -> Any:
     Implements eq. (10) of arXiv 2511.22502. Q (nx, nx) and R (nu, nu) must be positive
     semidefinite; anything else raises a ValueError.
     """
+    instance("trajectory", trajectory, Trajectory)
     Q, R = psd_matrix("Q", Q), psd_matrix("R", R)
     shaped("Q", Q, (trajectory.x.shape[-1],) * 2, "the trajectory's states")
     shaped("R", R, (trajectory.u.shape[-1],) * 2, "the trajectory's inputs")
@@ -148,6 +150,7 @@ def rollout(
     ValueError
         If x0 holds NaN, a shape does not fit, or ``steps`` is below 1.
     """
+    instance("system", system, LinearSystem)
     starts = shaped("x0", finite_array("x0", x0), (system.nx,), "the system's states")
     steps = positive_int("steps", steps)
     batch = starts.shape[:-1]
@@ -156,6 +159,8 @@ def rollout(
         x, u = _rollout_law(system.A, system.B, flat, steps, law)
     else:
         K = shaped("law", finite_array("law", law), (system.nu, system.nx), "a gain K")
+        if K.shape[:-2] not in ((), batch):
+            raise ValueError(f"law must hold one gain or one for each x0 {batch}, got {K.shape}")
         gains = jnp.broadcast_to(K, (*batch, system.nu, system.nx))
         x, u = _rollout_gain(
             system.A, system.B, flat, steps, gains.reshape(-1, system.nu, system.nx)
@@ -168,6 +173,8 @@ def rollout(
 def _scan(A: Any, B: Any, x0: Any, steps: int, law: Callable[[Any], Any]) -> tuple[Any, Any]:
     def step(x: Any, _: None) -> tuple[Any, tuple[Any, Any]]:
         u = law(x)
+        if jnp.shape(u) != (B.shape[1],):
+            raise ValueError(f"law must return shape ({B.shape[1]},), got {jnp.shape(u)}")
         x_next = A @ x + B @ u
         return x_next, (x_next, u)
 
@@ -249,6 +256,7 @@ def lqr_pool(
     Trajectory
         With leading dimension ``size``.
     """
+    instance("system", system, LinearSystem)
     size = positive_int("size", size)
     key_weights, key_states = jax.random.split(key)
     if weights is None:

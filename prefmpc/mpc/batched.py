@@ -55,12 +55,14 @@ def condense(system: LinearSystem, cost: QuadraticCost, horizon: int) -> Condens
     scale = 1 / jnp.sqrt(jnp.diag(H))
     H = (H * scale).T * scale
     H = (H + H.T) / 2
-    values = jnp.linalg.eigvalsh(H)
+    # The inverse comes from the same factorisation: two batched LAPACK calls that run at the
+    # same time can wait for each other for ever in XLA's thread pool when it has two threads.
+    values, vectors = jnp.linalg.eigh(H)
     return CondensedProblem(
         H=H,
         F=F * scale[:, None],
         scale=scale,
-        inverse=jnp.linalg.inv(H),
+        inverse=(vectors / values) @ vectors.T,
         largest=values[-1],
         smallest=values[0],
         lower=jnp.tile(system.u_min, horizon) / scale,
