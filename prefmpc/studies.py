@@ -105,7 +105,11 @@ def quadratic_data(
 def error_rates(models: QuadraticCost, comparisons: Comparisons) -> np.ndarray:
     """Return 1 − accuracy on ``comparisons`` for every model of a stack (c,)."""
     costs = np.asarray(jax.vmap(lambda model: model(comparisons.trajectories))(models))
-    return np.array([1 - accuracy(lambda _, row=row: row, comparisons) for row in costs])
+
+    def error_rate(row: np.ndarray) -> float:
+        return 1 - accuracy(lambda _: row, comparisons)
+
+    return np.array([error_rate(row) for row in costs])
 
 
 def quadratic_case(
