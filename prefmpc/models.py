@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import psd_matrix, require_x64, shaped
+from prefmpc._checks import instance, psd_matrix, require_x64, shaped
 from prefmpc._pytree import bypass_init, register_pytree
 from prefmpc.trajectories import Trajectory, random_weights, second_moments
 
@@ -107,6 +107,7 @@ class QuadraticCost:
 
         A stack of models needs a leading shape that broadcasts against the trajectories'.
         """
+        instance("trajectory", trajectory, Trajectory)
         nx, nu = _size(self.theta_Q), _size(self.theta_R)
         shaped("trajectory.x", trajectory.x, (None, nx), "time, then the model's states")
         shaped("trajectory.u", trajectory.u, (None, nu), "time, then the model's inputs")

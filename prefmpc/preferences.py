@@ -50,9 +50,15 @@ def one_by_one(ask: Callable[[Trajectory, Trajectory], float]) -> Preference:
     For anything that cannot be vectorised: a lookup, a simulation, a question to a person.
     """
 
+    if not callable(ask):
+        raise ValueError(f"ask must be a function of two trajectories, got {ask!r}")
+
     def preference(first: Trajectory, second: Trajectory) -> np.ndarray:
-        answers = [float(ask(first[i], second[i])) for i in range(len(first))]
-        return np.asarray(answers, dtype=np.float64)
+        answers = [ask(first[i], second[i]) for i in range(len(first))]
+        try:
+            return np.asarray([float(answer) for answer in answers])
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"ask must return a number for each pair: {error}") from None
 
     return preference
 
@@ -84,16 +90,7 @@ class Comparisons:
     def __init__(
         self, trajectories: Trajectory, first: ArrayLike, second: ArrayLike, labels: ArrayLike
     ) -> None:
-        if not isinstance(trajectories, Trajectory):
-            raise ValueError(
-                f"trajectories must be a Trajectory, got {type(trajectories).__name__}; "
-                "from plain arrays: Comparisons.from_arrays"
-            )
-        if len(trajectories.batch_shape) != 1:
-            raise ValueError(
-                "trajectories must have one leading dimension (n_t trajectories), "
-                f"got batch shape {trajectories.batch_shape}"
-            )
+        _check_pool(trajectories)
         labels = np.asarray(finite_array("labels", labels, ndim=1))
         if labels.size == 0:
             raise ValueError("labels must hold at least one comparison, got an empty data set")
@@ -129,6 +126,7 @@ class Comparisons:
         Pairs are drawn independently, so that one may come up twice. ``preference`` is called
         once, with two batches; wrap a function of single pairs in `one_by_one`.
         """
+        _check_pool(trajectories)
         size = positive_int("size", size)
         count = len(trajectories)
         if count < 2:
@@ -169,9 +167,8 @@ class Comparisons:
         """
         first = Trajectory(x_first, u_first, y_first)
         second = Trajectory(x_second, u_second, y_second)
-        if len(first.batch_shape) != 1 or jax.tree.map(np.shape, first) != jax.tree.map(
-            np.shape, second
-        ):
+        shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(side)] for side in (first, second)]
+        if len(first.batch_shape) != 1 or shapes[0] != shapes[1]:
             raise ValueError(
                 "first and second must have equal shapes with one leading dimension, got x "
                 f"{np.shape(first.x)} and {np.shape(second.x)}, u {np.shape(first.u)} and "
@@ -184,6 +181,15 @@ class Comparisons:
     def subset(self, index: ArrayLike) -> Comparisons:
         """Return the comparisons chosen by an integer or boolean index, in that order."""
         chosen = np.asarray(index)
+        n = len(self)
+        if chosen.dtype == bool:
+            fits = chosen.shape == (n,)
+        else:
+            whole = chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)
+            fits = whole and chosen.ndim == 1 and bool(((chosen >= -n) & (chosen < n)).all())
+            chosen = chosen.astype(int) if fits else chosen
+        if not fits:
+            raise ValueError(f"index must choose among the {n} comparisons, got {chosen}")
         return Comparisons(
             self.trajectories, self.first[chosen], self.second[chosen], self.labels[chosen]
         )
@@ -237,13 +243,26 @@ class Comparisons:
         wanted = {"format_version", "x", "u", "y", "first", "second", "labels"}
         if missing := sorted(wanted - stored.keys()):
             raise ValueError(f"path must be a file of saved comparisons, {path} lacks {missing}")
-        version = int(stored["format_version"])
-        if version != _FORMAT_VERSION:
+        version = stored["format_version"]
+        if version.shape != () or version != _FORMAT_VERSION:
             raise ValueError(
                 f"path must hold format version {_FORMAT_VERSION}, got {version} in {path}"
             )
         trajectories = Trajectory(stored["x"], stored["u"], stored["y"])
         return cls(trajectories, stored["first"], stored["second"], stored["labels"])
+
+
+def _check_pool(trajectories: Any) -> None:
+    if not isinstance(trajectories, Trajectory):
+        raise ValueError(
+            f"trajectories must be a Trajectory, got {type(trajectories).__name__}; "
+            "from plain arrays: Comparisons.from_arrays"
+        )
+    if len(trajectories.batch_shape) != 1:
+        raise ValueError(
+            "trajectories must have one leading dimension (n_t trajectories), "
+            f"got batch shape {trajectories.batch_shape}"
+        )
 
 
 def _pair_indices(name: str, value: ArrayLike, size: int, count: int) -> np.ndarray:

@@ -93,7 +93,7 @@ def test_a_trajectory_is_a_frozen_pytree_with_batches():
         T.x = X
     with pytest.raises(IndexError, match="no batch dimension"):
         T[0][0]
-    with pytest.raises(TypeError, match="its number of steps is .horizon"):
+    with pytest.raises(TypeError, match=r"its number of steps is \.horizon"):
         len(T[0])
 
 
