@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from jax.typing import ArrayLike
 
-from prefmpc._checks import positive_int
+from prefmpc._checks import instance, positive_int
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc.solution import MPCError, MPCSolution, check_problem, check_state
 from prefmpc.sets import Polyhedron
@@ -75,7 +75,10 @@ class LinearMPC:
             ("constraints", constraints, system.nx + system.nu),
             ("terminal", terminal, system.nx),
         ):
-            if given is not None and given.dim != dim:
+            if given is None:
+                continue
+            instance(name, given, Polyhedron)
+            if given.dim != dim:
                 raise ValueError(f"{name} must have dimension {dim}, got {given.dim}")
         self._build(constraints, terminal)
 
