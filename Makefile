@@ -2,6 +2,7 @@
 # make test    everything that must hold before a change is kept
 # make lab     JupyterLab on the notebooks
 # make notebooks   execute all notebooks again, in place
+# make bench   the times of the library, beside a peer's
 # make clean   remove what was built; the environment too
 #
 # Needs Python 3.11 or later with pip, and make. Everything else is installed
@@ -23,10 +24,10 @@ PYTHON ?= $(shell for p in python3.11 python3 python; do \
 export JAX_PLATFORMS ?= cpu
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help book test lab notebooks clean lint types unit nbval html html-strict test-html
+.PHONY: help book test lab notebooks bench clean lint types unit nbval html html-strict test-html
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | sed -n '1,8p'
+	@sed -n 's/^# \{0,1\}//p' Makefile | sed -n '1,9p'
 
 # The list is complete, so nothing has to be resolved; modules compile when first used.
 # The last line but one builds matplotlib's font cache, which would else write a message
@@ -63,6 +64,9 @@ notebooks: $(STAMP)
 
 lab: $(LAB_STAMP)
 	@$(BIN)/jupyter lab --notebook-dir=book
+
+bench: $(STAMP)
+	@$(BIN)/python -W ignore benchmarks/speed.py
 
 # ---- the checks ----
 

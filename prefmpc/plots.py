@@ -78,7 +78,9 @@ def responses(
     ax.axhline(0, color="#888888", linewidth=0.8, linestyle="-", zorder=0)
     ax.set(xlabel="time in s", ylabel=ylabel, title=title)
     if len(responses) > 1:
-        ax.legend(fontsize="small")
+        # Above the axes, where it hides no line; the title stands on the left.
+        columns = 1 if sum(map(len, responses)) > 32 else len(responses)
+        ax.legend(loc="lower right", bbox_to_anchor=(1, 1), fontsize="small", ncols=columns)
     return ax
 
 
