@@ -20,7 +20,7 @@ FIRST_MIN = 1.0
 
 @runtime_checkable
 class CostModel(Protocol):
-    """What `fit` needs of a σ model: a pytree of weights with three pure functions.
+    """What `fit` needs of a σ model: a pytree of weights with four pure functions.
 
     ``linear_in_features`` promises score(a) − score(b) = score(a − b): then a pair of
     trajectories enters the loss as one difference of features.
@@ -34,6 +34,9 @@ class CostModel(Protocol):
 
     def score(self, features: Any) -> Any:
         """Return σ (...) from features with the same leading shape."""
+
+    def __call__(self, trajectory: Trajectory) -> Any:
+        """Return σ(T) (...): the score of the features; a ValueError if T does not fit."""
 
     def bounds(self) -> tuple[Any, Any]:
         """Lower and upper bounds on the weights, in the model's own tree structure."""

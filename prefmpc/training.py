@@ -50,6 +50,8 @@ def pair_data(model: Any, comparisons: Comparisons, size: int | None = None) -> 
     n = len(comparisons)
     size = n if size is None else size
     features = jax.tree.map(np.asarray, model.features(comparisons.trajectories))
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(features)):
+        raise ValueError("trajectories must have finite features, got NaN or an overflow")
     padding = np.zeros(size - n, dtype=int)
     i = np.concatenate([comparisons.first, padding])
     j = np.concatenate([comparisons.second, padding])
@@ -365,6 +367,8 @@ def _check_options(
 ) -> None:
     if not isinstance(comparisons, Comparisons):
         raise ValueError(f"comparisons must be Comparisons, got {type(comparisons).__name__}")
+    if test is not None and not isinstance(test, Comparisons):
+        raise ValueError(f"test must be Comparisons, got {type(test).__name__}")
     if selection not in get_args(Selection):
         raise ValueError(f"selection must be one of {get_args(Selection)}, got {selection!r}")
     if (test is None) == (selection == "leaky_test_accuracy"):
