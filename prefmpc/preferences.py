@@ -14,6 +14,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from prefmpc._checks import finite_array, positive_int, psd_matrix
+from prefmpc._random import generator
 from prefmpc.trajectories import Trajectory, phi
 
 Preference = Callable[[Trajectory, Trajectory], Any]
@@ -131,9 +132,9 @@ class Comparisons:
         count = len(trajectories)
         if count < 2:
             raise ValueError(f"trajectories must hold at least two to compare, got {count}")
-        key_first, key_gap = jax.random.split(key)
-        first = np.asarray(jax.random.randint(key_first, (size,), 0, count))
-        gap = np.asarray(jax.random.randint(key_gap, (size,), 1, count))
+        rng = generator(key)
+        first = rng.integers(0, count, size)
+        gap = rng.integers(1, count, size)
         second = (first + gap) % count
         labels = np.asarray(preference(trajectories[first], trajectories[second]))
         if labels.shape != (size,):

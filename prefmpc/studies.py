@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from prefmpc._random import generator
 from prefmpc.evaluation import accuracy, closed_loops
 from prefmpc.models import QuadraticCost
 from prefmpc.preferences import Comparisons, QuadraticPreference
@@ -84,19 +85,19 @@ def quadratic_data(
     The paper does not say whether test pairs come from the 50 training trajectories
     (``shared_pool``) or from others (default).
     """
-    keys = jax.random.split(key, 3 + len(sizes))
+    streams = generator(key).spawn(3 + len(sizes))
     system = oscillating_masses()
     preference = QuadraticPreference(QUADRATIC_Q, QUADRATIC_R)
 
     def make_pool(pool_key: Any) -> Trajectory:
         return lqr_pool(system, 50, QUADRATIC_HORIZON, key=pool_key, radius=RADIUS)
 
-    pool = make_pool(keys[0])
-    test_pool = pool if shared_pool else make_pool(keys[1])
-    test = Comparisons.random(test_pool, preference, 500, key=keys[2])
+    pool = make_pool(streams[0])
+    test_pool = pool if shared_pool else make_pool(streams[1])
+    test = Comparisons.random(test_pool, preference, 500, key=streams[2])
     train = {
         n: Comparisons.random(pool, preference, n, key=k)
-        for n, k in zip(sizes, keys[3:], strict=True)
+        for n, k in zip(sizes, streams[3:], strict=True)
     }
     return system, pool, train, test
 
@@ -122,9 +123,9 @@ def quadratic_case(
     steps: int = 30,
 ) -> QuadraticDraw:
     """Run case study 1 once: data, five training sets, 200 closed loops for each controller."""
-    key_data, key_fit, key_states, key_random = jax.random.split(key, 4)
+    key_data, key_fit, key_states, key_random = generator(key).spawn(4)
     system, pool, train, test = quadratic_data(key=key_data, shared_pool=shared_pool)
-    fit_keys = jax.random.split(key_fit, len(SIZES))
+    fit_keys = key_fit.spawn(len(SIZES))
     leaked = test if selection == "leaky_test_accuracy" else None
     fits = {
         n: fit(train[n], key=k, restarts=restarts, selection=selection, test=leaked, tol=tol)
@@ -181,10 +182,10 @@ def quadratic_variants(*, key: Any, restarts: int = 20, loops: int = 200) -> np.
     the pairs left by the validation split.
     """
     case = quadratic_case(key=key, restarts=restarts, loops=loops)
-    key_data, key_fit, key_states, _ = jax.random.split(key, 4)
+    key_data, key_fit, key_states, _ = generator(key).spawn(4)
     _, _, _, inner = quadratic_data(key=key_data, shared_pool=True)
     chosen: dict[str, list[Any]] = {name: [] for name in VARIANTS}
-    for n, k in zip(SIZES, jax.random.split(key_fit, len(SIZES)), strict=True):
+    for n, k in zip(SIZES, key_fit.spawn(len(SIZES)), strict=True):
         result = case.fits[n]
         for name, score in {
             "training loss": result.training_loss,

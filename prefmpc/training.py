@@ -15,6 +15,7 @@ import optax
 
 from prefmpc._checks import nonnegative, positive_int, require_x64
 from prefmpc._lbfgsb import minimise
+from prefmpc._random import generator
 from prefmpc.models import CostModel, QuadraticCost
 from prefmpc.preferences import Comparisons
 
@@ -203,14 +204,14 @@ def fit(
     _check_options(comparisons, selection, validation_fraction, test)
     l2, l1, tol = nonnegative("l2", l2), nonnegative("l1", l1), nonnegative("tol", tol)
     learning_rate = nonnegative("learning_rate", learning_rate)
-    key_start, key_split = jax.random.split(key)
-    starts = _starts(comparisons, initial, restarts, key_start)
+    rng = generator(key)
+    starts = _starts(comparisons, initial, restarts, rng)
 
     n = len(comparisons)
     data = pair_data(starts, comparisons, _padded_size(n))
     held_out = np.zeros(0, dtype=int)
     if selection == "validation":
-        order = np.asarray(jax.random.permutation(key_split, n))
+        order = rng.permutation(n)
         held_out = order[: max(1, round(validation_fraction * n))]
         weights = data.weights.copy()
         weights[held_out] = 0.0

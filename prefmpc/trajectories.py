@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import finite_array, instance, nonnegative, positive_int, psd_matrix, shaped
 from prefmpc._pytree import bypass_init, register_pytree
+from prefmpc._random import generator
 from prefmpc.systems import LinearSystem
 
 
@@ -212,14 +213,14 @@ def random_weights(
     if not 0 < nonnegative("low", low) < nonnegative("high", high):
         raise ValueError(f"low and high must satisfy 0 < low < high, got {low} and {high}")
     nonnegative("coupling", coupling)
-    keys = jax.random.split(key, 4)
+    rng = generator(key)
 
-    def draw(key_square: Any, key_diagonal: Any, n: int) -> np.ndarray:
-        M = coupling * np.asarray(jax.random.normal(key_square, (*shape, n, n)))
-        d = np.asarray(jax.random.uniform(key_diagonal, (*shape, n), minval=low, maxval=high))
+    def draw(n: int) -> np.ndarray:
+        M = coupling * rng.standard_normal((*shape, n, n))
+        d = rng.uniform(low, high, (*shape, n))
         return np.swapaxes(M, -1, -2) @ M / 2 + d[..., None] * np.eye(n)
 
-    return draw(keys[0], keys[1], nx), draw(keys[2], keys[3], nu)
+    return draw(nx), draw(nu)
 
 
 def random_states(radius: ArrayLike, *, key: Any, shape: tuple[int, ...] = ()) -> np.ndarray:
@@ -227,8 +228,7 @@ def random_states(radius: ArrayLike, *, key: Any, shape: tuple[int, ...] = ()) -
     radius = np.asarray(finite_array("radius", radius, ndim=1))
     if (radius < 0).any():
         raise ValueError(f"radius must not be negative, got {radius}")
-    unit = jax.random.uniform(key, (*shape, radius.size), minval=-1.0, maxval=1.0)
-    return np.asarray(unit) * radius
+    return generator(key).uniform(-1.0, 1.0, (*shape, radius.size)) * radius
 
 
 def lqr_pool(
@@ -258,14 +258,14 @@ def lqr_pool(
     """
     instance("system", system, LinearSystem)
     size = positive_int("size", size)
-    key_weights, key_states = jax.random.split(key)
+    rng = generator(key)
     if weights is None:
-        Q, R = random_weights(system.nx, system.nu, key=key_weights, shape=(size,))
+        Q, R = random_weights(system.nx, system.nu, key=rng, shape=(size,))
     else:
         Q = np.asarray(finite_array("weights[0]", weights[0], ndim=3))
         R = np.asarray(finite_array("weights[1]", weights[1], ndim=3))
         if len(Q) != size or len(R) != size:
             raise ValueError(f"weights must hold {size} matrices each, got {len(Q)} and {len(R)}")
     gains = np.stack([system.lqr(q, r)[0] for q, r in zip(Q, R, strict=True)])
-    x0 = random_states(radius, key=key_states, shape=(size,))
+    x0 = random_states(radius, key=rng, shape=(size,))
     return rollout(system, x0, gains, steps)
