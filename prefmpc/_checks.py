@@ -60,6 +60,12 @@ def instance(name: str, value: Any, wanted: type) -> None:
         raise ValueError(f"{name} must be a {wanted.__name__}, got {type(value).__name__}")
 
 
+def function(name: str, value: Any) -> None:
+    """Raise a ValueError unless ``value`` can be called."""
+    if not callable(value):
+        raise ValueError(f"{name} must be a function, got {value!r}")
+
+
 def shaped(name: str, array: Any, shape: tuple[int | None, ...], meaning: str = "") -> Any:
     """Check the trailing dimensions of ``array`` against ``shape`` (None: any size)."""
     got = array.shape[-len(shape) :] if shape else ()

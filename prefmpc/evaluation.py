@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import nonnegative, positive_int
+from prefmpc._checks import function, instance, nonnegative, positive_int
 from prefmpc._pytree import bypass_init
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc.batched import broadcast_states, condense, each_cost, solve_box
@@ -31,6 +31,8 @@ def accuracy(model: Callable[[Trajectory], Any], comparisons: Comparisons) -> fl
 
     ``model`` is any function that maps a batch of trajectories (n_t,) to costs (n_t,).
     """
+    function("model", model)
+    instance("comparisons", comparisons, Comparisons)
     costs = np.asarray(model(comparisons.trajectories))
     count = len(comparisons.trajectories)
     if costs.shape != (count,):
@@ -66,8 +68,8 @@ def simulate(
     MPCError
         If an MPC controller finds no solution on the way.
     """
-    if not isinstance(system, LinearSystem):
-        raise ValueError(f"system must be a LinearSystem, got {type(system).__name__}")
+    instance("system", system, LinearSystem)
+    function("controller", controller)
     x0 = np.asarray(check_state(x0, system.nx))
     steps = positive_int("steps", steps)
     starts = x0.reshape(-1, system.nx)

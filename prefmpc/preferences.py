@@ -13,7 +13,7 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, positive_int, psd_matrix
+from prefmpc._checks import finite_array, function, positive_int, psd_matrix
 from prefmpc._random import generator
 from prefmpc.trajectories import Trajectory, phi
 
@@ -51,8 +51,7 @@ def one_by_one(ask: Callable[[Trajectory, Trajectory], float]) -> Preference:
     For anything that cannot be vectorised: a lookup, a simulation, a question to a person.
     """
 
-    if not callable(ask):
-        raise ValueError(f"ask must be a function of two trajectories, got {ask!r}")
+    function("ask", ask)
 
     def preference(first: Trajectory, second: Trajectory) -> np.ndarray:
         answers = [ask(first[i], second[i]) for i in range(len(first))]

@@ -11,7 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, instance, nonnegative, positive_int, psd_matrix, shaped
+from prefmpc._checks import (
+    finite_array,
+    instance,
+    nonnegative,
+    positive_int,
+    psd_matrix,
+    require_x64,
+    shaped,
+)
 from prefmpc._pytree import bypass_init, register_pytree
 from prefmpc._random import generator
 from prefmpc.systems import LinearSystem
@@ -209,6 +217,7 @@ def random_weights(
     III-A) says "predominantly diagonal, with diagonal elements in [0.1, 10]" and no more; this
     reading gives its row "Random" of Table I.
     """
+    require_x64()
     nx, nu = positive_int("nx", nx), positive_int("nu", nu)
     if not 0 < nonnegative("low", low) < nonnegative("high", high):
         raise ValueError(f"low and high must satisfy 0 < low < high, got {low} and {high}")

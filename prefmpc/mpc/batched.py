@@ -41,6 +41,7 @@ class CondensedProblem(NamedTuple):
 
 
 def condense(system: LinearSystem, cost: QuadraticCost, horizon: int) -> CondensedProblem:
+    """Eliminate the states of eq. (12) of arXiv 2511.22502: a problem in the inputs alone."""
     A, B = jnp.asarray(system.A), jnp.asarray(system.B)
     nx, nu = system.nx, system.nu
     power, response = [jnp.eye(nx)], [jnp.zeros((nx, horizon * nu))]
