@@ -97,5 +97,5 @@ test-html: $(STAMP)
 	@$(BIN)/python -m pytest -q tests/html
 
 clean:
-	@rm -rf $(VENV) _build build dist ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	@rm -rf $(VENV) _build build dist ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .cache
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
