@@ -228,7 +228,7 @@ def oscillating_masses(
     dt : float
         Sample time in s.
     u_max : float
-        Largest force in N: |u| ≤ u_max. ``np.inf`` leaves the force unbounded.
+        Largest force in N, in both directions. ``np.inf`` leaves the force unbounded.
 
     Raises
     ------

@@ -211,7 +211,7 @@ def random_weights(
     high: float = 10.0,
     coupling: float = 0.1,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Draw predominantly diagonal weights Q (*shape, nx, nx) and R (*shape, nu, nu).
+    """Draw predominantly diagonal weights Q ``(*shape, nx, nx)`` and R ``(*shape, nu, nu)``.
 
     Each is MᵀM/2 + diag(U[low, high]) with M = ``coupling`` · standard normal. The paper (section
     III-A) says "predominantly diagonal, with diagonal elements in [0.1, 10]" and no more; this
@@ -233,7 +233,7 @@ def random_weights(
 
 
 def random_states(radius: ArrayLike, *, key: Any, shape: tuple[int, ...] = ()) -> np.ndarray:
-    """Draw states (*shape, nx), each entry uniform in [−radius, radius]; ``radius`` is (nx,)."""
+    """Draw states ``(*shape, nx)``, each entry uniform in [−radius, radius]; radius is (nx,)."""
     radius = np.asarray(finite_array("radius", radius, ndim=1))
     if (radius < 0).any():
         raise ValueError(f"radius must not be negative, got {radius}")
