@@ -104,10 +104,11 @@ def test_everything_public_has_a_docstring(name):
 
 
 # What each module may import of prefmpc: arrows point one way. See ARCHITECTURE.md.
-HELPERS = {"_checks", "_pytree"}
+HELPERS = {"_checks", "_pytree", "_random"}
 LAYERS = {
     "_checks": set(),
     "_pytree": set(),
+    "_random": {"_checks"},
     "_lbfgsb": set(),
     "systems": HELPERS,
     "sets": HELPERS,
@@ -118,7 +119,7 @@ LAYERS = {
     "mpc": HELPERS | {"systems", "sets", "trajectories", "models", "mpc"},
     "evaluation": HELPERS | {"systems", "trajectories", "preferences", "models", "mpc"},
     "studies": {
-        *("systems", "sets", "trajectories", "preferences", "models"),
+        *("_random", "systems", "sets", "trajectories", "preferences", "models"),
         *("training", "mpc", "evaluation"),
     },
     "plots": set(),

@@ -240,10 +240,20 @@ def test_what_fit_reports_is_what_its_models_do(data):
     np.testing.assert_array_equal(result.model.theta, result.models.theta[result.chosen])
 
 
-def test_validation_scores_pairs_that_training_never_saw(learned, data):
+def test_validation_scores_pairs_that_training_never_saw(learned, data, monkeypatch):
     train = data[2][400]
-    # fit draws the split from the second half of its key; 20 % of the pairs stay out.
-    held_out = np.asarray(jax.random.permutation(jax.random.split(KEY)[1], 400))[:80]
+    seen = []
+    inner = training._train
+
+    def spy(starts, pairs, *rest):
+        seen.append(pairs.weights)
+        return inner(starts, pairs, *rest)
+
+    monkeypatch.setattr(training, "_train", spy)
+    fit(train, key=KEY)
+    held_out = np.flatnonzero(seen[0][:400] == 0)
+    assert held_out.size == 80  # 20 % of 400
+    assert not seen[0][400:].any()
     scores = [
         float(cross_entropy(learned.models[i], pair_data(learned.models, train.subset(held_out))))
         for i in range(20)
@@ -427,6 +437,8 @@ LOSS = {"selection": "training_loss"}
         (lambda: fit(FEW, key=KEY, validation_fraction=1.0), r"must lie in \(0, 1\), got 1"),
         (lambda: fit(FEW, key=KEY, validation_fraction=np.nan), r"must lie in \(0, 1\), got nan"),
         (lambda: fit(FEW.subset([0]), key=KEY), "enough pairs to split for validation, got 1"),
+        (lambda: fit(FEW, key=0), "key must be a single JAX random key.*got int"),
+        (lambda: fit(FEW, key=jax.random.split(KEY)), r"key must be a single.*\(2,\)"),
         (lambda: fit(FEW, key=KEY, restarts=0), "restarts must be a whole number of at least 1"),
         (lambda: fit(FEW, key=KEY, l2=-1), "l2 must be finite and at least 0, got -1"),
         (lambda: fit(FEW, key=KEY, l1=np.nan), "l1 must be finite"),

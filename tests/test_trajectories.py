@@ -173,6 +173,19 @@ def test_random_states_fill_their_box():
     np.testing.assert_array_equal(x, random_states([1.0, 0.0, 3.0], key=KEY, shape=(4000,)))
 
 
+def test_every_kind_of_key():
+    one, two = jax.random.split(KEY)
+
+    def draw(key):
+        return random_states(np.ones(3), key=key)
+
+    np.testing.assert_array_equal(draw(one), draw(jax.random.clone(one)))
+    np.testing.assert_array_equal(draw(one), draw(jax.random.key_data(one)))  # an old-style key
+    assert (draw(one) != draw(two)).all()
+    generator = np.random.default_rng(0)
+    assert (draw(generator) != draw(generator)).all()  # NumPy's own moves on
+
+
 NAN_X = X.copy()
 NAN_X[1, 0] = np.nan
 MASSES = oscillating_masses()
@@ -214,6 +227,7 @@ MASSES = oscillating_masses()
         (lambda: random_weights(1, 1, key=KEY, coupling=-1), "coupling must be finite and at"),
         (lambda: random_states([-1.0], key=KEY), "radius must not be negative"),
         (lambda: random_states([np.nan], key=KEY), "radius must be finite"),
+        (lambda: random_states([1.0], key=0), "key must be a single JAX random key.*got int"),
         (lambda: random_states(1.0, key=KEY), "radius must have 1 dimension"),
         (lambda: lqr_pool(MASSES, 0, 5, key=KEY, radius=np.ones(6)), "size must be a whole"),
         (lambda: lqr_pool(MASSES, 2, 0, key=KEY, radius=np.ones(6)), "steps must be a whole"),
