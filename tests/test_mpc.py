@@ -210,7 +210,7 @@ def clarabel():
 
     def solve(state):
         x0.value = state
-        problem.solve(solver=cp.CLARABEL)
+        problem.solve(solver=cp.CLARABEL, tol_gap_abs=1e-11, tol_gap_rel=1e-11, tol_feas=1e-10)
         return problem.status, u.value
 
     return solve
@@ -219,7 +219,7 @@ def clarabel():
 def test_coupled_constraints_and_what_cannot_be_done(clarabel):
     controller = LinearMPC(MASSES, PAPER, N, constraints=COUPLED, terminal=TERMINAL)
     plain = LinearMPC(MASSES, PAPER, N)
-    states = random_states(np.array([0.8, 0.8, 0.8, 0.6, 0.6, 0.6]), key=KEY, shape=(30,))
+    states = random_states(np.array([0.8, 0.8, 0.8, 0.6, 0.6, 0.6]), key=KEY, shape=(60,))
     seen = {"optimal": 0, "infeasible": 0}
     matters = 0
     for state in states:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 from jax.typing import ArrayLike
+from scipy.optimize import Bounds, LinearConstraint, milp
 
 from prefmpc._checks import instance, positive_int
 from prefmpc.models import QuadraticCost
@@ -25,6 +26,8 @@ _SETTINGS = {
     "max_iter": 20_000,
     "verbose": False,
 }
+
+_ANYTHING = Bounds(-np.inf, np.inf)
 
 
 class LinearMPC:
@@ -113,12 +116,13 @@ class LinearMPC:
             )
             lower.append(np.full(len(terminal.h), -np.inf))
             upper.append(terminal.h)
+        self._rows = sp.vstack(rows, format="csc")
         self._lower, self._upper = np.concatenate(lower), np.concatenate(upper)
         self._solver = osqp.OSQP()
         self._solver.setup(
             sp.triu(P, format="csc"),  # OSQP reads a lower triangle without complaint, and wrongly
             np.zeros(states + inputs),
-            sp.vstack(rows, format="csc"),
+            self._rows,
             self._lower,
             self._upper,
             **_SETTINGS,
@@ -142,22 +146,31 @@ class LinearMPC:
             raise MPCError(solution)
         return solution.u
 
+    def _feasible(self) -> bool:
+        """Whether any point satisfies the constraints: a linear program, where OSQP cannot tell."""
+        limits = LinearConstraint(self._rows, self._lower, self._upper)
+        answer = milp(np.zeros(self._rows.shape[1]), constraints=limits, bounds=_ANYTHING)
+        return int(answer.status) != 2
+
     def _solution(self, x0: np.ndarray, result: Any, seconds: float) -> MPCSolution:
         import osqp
 
         N, nx, nu = self.horizon, self.system.nx, self.system.nu
+        nothing = (
+            "infeasible",
+            f"no input sequence keeps x(0) = {np.array2string(x0, precision=4)} "
+            f"within the constraints over {N} steps",
+        )
         status, message = {
             osqp.SolverStatus.OSQP_SOLVED: ("solved", "optimal"),
-            osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE: (
-                "infeasible",
-                f"no input sequence keeps x(0) = {np.array2string(x0, precision=4)} "
-                f"within the constraints over {N} steps",
-            ),
+            osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE: nothing,
             osqp.SolverStatus.OSQP_MAX_ITER_REACHED: (
                 "max_iterations",
                 f"no solution of the wanted accuracy after {result.info.iter} iterations",
             ),
         }.get(result.info.status_val, ("failed", f"OSQP says {result.info.status!r}"))
+        if status not in ("solved", "infeasible") and not self._feasible():
+            status, message = nothing
         inputs = np.full((N, nu), np.nan)
         states = np.full((N + 1, nx), np.nan)
         cost = np.nan
