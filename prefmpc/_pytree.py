@@ -45,3 +45,12 @@ def register_pytree(cls: type[T], static: tuple[str, ...] = ()) -> type[T]:
 
     jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
     return cls
+
+
+def check_index(index: Any, size: int) -> None:
+    """Raise an IndexError for a whole number outside of ``size`` entries.
+
+    JAX clamps such an index instead, and a ``for`` loop over a stack would never end.
+    """
+    if isinstance(index, int) and not -size <= index < size:
+        raise IndexError(f"index must lie in [{-size}, {size - 1}], got {index}")

@@ -11,7 +11,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from prefmpc._checks import instance, psd_matrix, require_x64, shaped
-from prefmpc._pytree import bypass_init, register_pytree
+from prefmpc._pytree import bypass_init, check_index, register_pytree
 from prefmpc.trajectories import Trajectory, random_weights, second_moments
 
 DIAGONAL_MIN = 0.01
@@ -103,6 +103,7 @@ class QuadraticCost:
         """Index the leading dimensions of a stack of models."""
         if not self.batch_shape:
             raise IndexError("a single QuadraticCost has no batch dimension to index")
+        check_index(index, self.batch_shape[0])
         return jax.tree.map(lambda leaf: leaf[index], self)
 
     def __call__(self, trajectory: Trajectory) -> Any:

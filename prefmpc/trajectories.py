@@ -20,7 +20,7 @@ from prefmpc._checks import (
     require_x64,
     shaped,
 )
-from prefmpc._pytree import bypass_init, register_pytree
+from prefmpc._pytree import bypass_init, check_index, register_pytree
 from prefmpc._random import generator
 from prefmpc.systems import LinearSystem
 
@@ -86,6 +86,7 @@ class Trajectory:
         """Index the leading batch dimensions."""
         if not self.batch_shape:
             raise IndexError("a single trajectory has no batch dimension to index")
+        check_index(index, self.batch_shape[0])
         return jax.tree.map(lambda leaf: leaf[index], self)
 
     def __len__(self) -> int:

@@ -135,3 +135,10 @@ def test_frozen_and_a_cost_model():
 def test_bad_input_is_named(call, words):
     with pytest.raises(ValueError, match=words):
         call()
+
+
+def test_a_loop_over_a_stack_ends() -> None:
+    stack = QuadraticCost.random(2, 1, key=jax.random.key(0), shape=(3,))
+    assert len(list(stack)) == 3
+    with pytest.raises(IndexError, match="got 3"):
+        stack[3]
