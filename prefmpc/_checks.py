@@ -24,6 +24,20 @@ def is_traced(value: Any) -> bool:
     return isinstance(value, jax.core.Tracer)
 
 
+def array_module(*arrays: Any) -> Any:
+    """Return `numpy` if all ``arrays`` are NumPy's, else `jax.numpy`.
+
+    Data stay in NumPy until a compiled program takes them: outside of one, JAX compiles every
+    single operation for every shape, which takes longer than all that is then computed.
+    """
+    return np if all(isinstance(array, (np.ndarray, np.generic)) for array in arrays) else jnp
+
+
+def to_numpy(tree: Any) -> Any:
+    """Return a pytree with NumPy leaves (tracers stay), for the same reason."""
+    return jax.tree.map(lambda leaf: leaf if is_traced(leaf) else np.asarray(leaf), tree)
+
+
 def finite_array(name: str, value: Any, ndim: int | None = None, *, allow_inf: bool = False) -> Any:
     """Return ``value`` as a float64 array; raise a ValueError if it cannot be one or has NaN.
 

@@ -12,14 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import function, instance, nonnegative, positive_int
-from prefmpc._pytree import bypass_init
+from prefmpc._checks import function, instance, nonnegative, positive_int, to_numpy
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc.batched import broadcast_states, condense, each_cost, solve_box
 from prefmpc.mpc.solution import check_problem, check_state
 from prefmpc.preferences import Comparisons
 from prefmpc.systems import LinearSystem
-from prefmpc.trajectories import Trajectory
+from prefmpc.trajectories import Trajectory, from_flat
 
 
 def accuracy(model: Callable[[Trajectory], Any], comparisons: Comparisons) -> float:
@@ -86,10 +85,7 @@ def simulate(
                 )
             u[i, k] = action
             x[i, k + 1] = system.A @ x[i, k] + system.B @ action
-    batch = x0.shape[:-1]
-    x = x.reshape(*batch, steps + 1, system.nx)
-    u = u.reshape(*batch, steps, system.nu)
-    return Trajectory(x, u, x[..., :-1, :] @ system.C.T)
+    return from_flat(system, x, u, x0.shape[:-1])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -146,12 +142,13 @@ def closed_loops(
     states = check_state(x0, system.nx)
     starts, lead = broadcast_states(states, len(stack.theta_Q), stacked, system.nx)
     x, u, count = _loop_many(system, stack, horizon, starts, steps, nonnegative("tol", tol))
-    x = np.asarray(x).reshape(*lead, steps + 1, system.nx)
-    u = np.asarray(u).reshape(*lead, steps, system.nu)
+    x, u, count = to_numpy((x, u, count))
+    flat = (-1, steps + 1, system.nx), (-1, steps, system.nu)
+    trajectories = from_flat(system, x.reshape(flat[0]), u.reshape(flat[1]), lead)
     return ClosedLoops(
-        trajectories=bypass_init(Trajectory, x=x, u=u, y=x[..., :-1, :] @ system.C.T),
-        solved=np.isfinite(u).all(axis=(-2, -1)),
-        iterations=np.asarray(count).reshape(lead),
+        trajectories=trajectories,
+        solved=np.isfinite(trajectories.u).all(axis=(-2, -1)),
+        iterations=count.reshape(lead),
         seconds=time.perf_counter() - began,
     )
 

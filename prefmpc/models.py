@@ -6,11 +6,10 @@ import dataclasses
 from typing import Any, Protocol, runtime_checkable
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import instance, psd_matrix, require_x64, shaped
+from prefmpc._checks import array_module, instance, psd_matrix, require_x64, shaped
 from prefmpc._pytree import bypass_init, check_index, register_pytree
 from prefmpc.trajectories import Trajectory, random_weights, second_moments
 
@@ -74,25 +73,25 @@ class QuadraticCost:
             raise ValueError(
                 f"Q and R must have the same batch shape, got {Q.shape[:-2]} and {R.shape[:-2]}"
             )
-        object.__setattr__(self, "theta_Q", jnp.asarray(_pack(_semidefinite_factor(Q))))
-        object.__setattr__(self, "theta_R", jnp.asarray(_pack(_semidefinite_factor(R))))
+        object.__setattr__(self, "theta_Q", _pack(_semidefinite_factor(Q)))
+        object.__setattr__(self, "theta_R", _pack(_semidefinite_factor(R)))
 
     @property
     def Q(self) -> Any:
         """State weight (..., nx, nx)."""
         factor = _unpack(self.theta_Q)
-        return factor @ jnp.swapaxes(factor, -1, -2)
+        return factor @ factor.swapaxes(-1, -2)
 
     @property
     def R(self) -> Any:
         """Input weight (..., nu, nu)."""
         factor = _unpack(self.theta_R)
-        return factor @ jnp.swapaxes(factor, -1, -2)
+        return factor @ factor.swapaxes(-1, -2)
 
     @property
     def theta(self) -> Any:
         """All weights θ (..., n_Q + n_R): first the factor of Q, then that of R."""
-        return jnp.concatenate([self.theta_Q, self.theta_R], axis=-1)
+        return _join(self.theta_Q, self.theta_R)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -125,16 +124,14 @@ class QuadraticCost:
         product with the lower triangles of Q and R.
         """
         moments = second_moments(trajectory)
-        return jnp.concatenate(
-            [_pack(S + jnp.tril(S, -1)) for S in (moments.Sx, moments.Su)], axis=-1
-        )
+        return _join(*(_pack(S * (2 - np.eye(S.shape[-1]))) for S in moments))
 
     def score(self, features: Any) -> Any:
         """Return ⟨Q, S_x⟩ + ⟨R, S_u⟩ from the packed second moments."""
-        weights = jnp.concatenate([_pack(self.Q), _pack(self.R)], axis=-1)
+        weights = _join(_pack(self.Q), _pack(self.R))
         if not self.batch_shape:
             return features @ weights  # one matrix product in the training loop
-        return jnp.sum(features * weights, axis=-1)
+        return (features * weights).sum(-1)
 
     def bounds(self) -> tuple[QuadraticCost, QuadraticCost]:
         """Return the paper's bounds on θ as two models: diagonal ≥ 0.01, its first entry ≥ 1."""
@@ -143,14 +140,14 @@ class QuadraticCost:
             rows, columns = np.tril_indices(_size(theta))
             bound = np.where(rows == columns, DIAGONAL_MIN, -np.inf)
             bound[0] = first
-            return jnp.broadcast_to(jnp.asarray(bound), theta.shape)
+            return np.broadcast_to(bound, theta.shape)
 
         low = bypass_init(
             QuadraticCost,
             theta_Q=lower(self.theta_Q, FIRST_MIN),
             theta_R=lower(self.theta_R, DIAGONAL_MIN),
         )
-        high = jax.tree.map(lambda leaf: jnp.full_like(leaf, jnp.inf), low)
+        high = jax.tree.map(lambda leaf: np.full(leaf.shape, np.inf), low)
         return low, high
 
     @classmethod
@@ -174,6 +171,10 @@ def _pack(matrix: Any) -> Any:
     """Return the lower triangle (..., n (n + 1) / 2), row by row."""
     rows, columns = np.tril_indices(matrix.shape[-1])
     return matrix[..., rows, columns]
+
+
+def _join(first: Any, second: Any) -> Any:
+    return array_module(first, second).concatenate([first, second], axis=-1)
 
 
 def _unpack(theta: Any) -> Any:

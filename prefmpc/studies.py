@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from prefmpc._random import generator
@@ -104,7 +103,8 @@ def quadratic_data(
 
 def error_rates(models: QuadraticCost, comparisons: Comparisons) -> np.ndarray:
     """Return 1 − accuracy on ``comparisons`` for every model of a stack (c,)."""
-    costs = np.asarray(jax.vmap(lambda model: model(comparisons.trajectories))(models))
+    pool = comparisons.trajectories
+    costs = np.stack([models[i](pool) for i in range(models.batch_shape[0])])
 
     def error_rate(row: np.ndarray) -> float:
         return 1 - accuracy(lambda _: row, comparisons)
@@ -133,7 +133,7 @@ def quadratic_case(
     }
     true = QuadraticCost(QUADRATIC_Q, QUADRATIC_R)
     learned = [true, *(fits[n].model for n in SIZES)]
-    stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *learned)
+    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *learned)
     x0 = random_states(RADIUS, key=key_states, shape=(loops,))
     many = closed_loops(system, stack, x0, horizon=QUADRATIC_HORIZON, steps=steps)
     # Every simulation of the row "Random" has a controller of its own.
@@ -193,7 +193,7 @@ def quadratic_variants(*, key: Any, restarts: int = 20, loops: int = 200) -> np.
             "test pairs from the training pool": error_rates(result.models, inner),
         }.items():
             index = best_restart(score, result.status, result.training_loss)
-            chosen[name].append(jax.tree.map(lambda leaf, i=index: leaf[i], result.models))
+            chosen[name].append(result.models[index])
         chosen["paper"].append(result.model)
         held_out = fit(case.train[n], key=k, restarts=restarts, selection="validation")
         chosen["validation split"].append(held_out.model)
@@ -202,7 +202,7 @@ def quadratic_variants(*, key: Any, restarts: int = 20, loops: int = 200) -> np.
     tables[:, :, COLUMNS.index("time s")] = np.nan
     x0 = random_states(RADIUS, key=key_states, shape=(loops,))
     everyone = [model for name in VARIANTS for model in chosen[name]]
-    stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *everyone)
+    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *everyone)
     runs = closed_loops(case.system, stack, x0, horizon=QUADRATIC_HORIZON, steps=30)
     if not runs.solved.all():
         raise RuntimeError("a closed loop met an MPC problem that was not solved")

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from prefmpc._checks import nonnegative, positive_int, require_x64
+from prefmpc._checks import instance, nonnegative, positive_int, require_x64, to_numpy
 from prefmpc._lbfgsb import minimise
 from prefmpc._random import generator
 from prefmpc.models import CostModel, QuadraticCost
@@ -50,7 +50,8 @@ def pair_data(model: Any, comparisons: Comparisons, size: int | None = None) -> 
     """Compute the features of all pairs once, padded with pairs of weight 0 to ``size``."""
     n = len(comparisons)
     size = n if size is None else size
-    features = jax.tree.map(np.asarray, model.features(comparisons.trajectories))
+    with np.errstate(over="ignore"):  # said in one sentence below
+        features = jax.tree.map(np.asarray, model.features(comparisons.trajectories))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(features)):
         raise ValueError("trajectories must have finite features, got NaN or an overflow")
     padding = np.zeros(size - n, dtype=int)
@@ -220,7 +221,7 @@ def fit(
     settings = (l2, l1, learning_rate, positive_int("max_iterations", max_iterations), tol)
     split_signs = l1 > 0  # |θ| is smooth only where θ is split into its two signs
     out = _train(starts, data, settings, positive_int("adam_steps", adam_steps), split_signs)
-    models, loss, accuracy, iterations, error, violation = jax.tree.map(np.asarray, out)
+    models, loss, accuracy, iterations, error, violation = to_numpy(out)
 
     finite = np.isfinite(loss)
     for leaf in jax.tree.leaves(models):
@@ -238,7 +239,7 @@ def fit(
         assert test is not None
         score = _scores(models, test, "errors")
     result = FitResult(
-        models=jax.tree.map(jnp.asarray, models),
+        models=models,
         chosen=best_restart(score, status, loss),
         selection=selection,
         selection_score=score,
@@ -366,10 +367,9 @@ def _starts(
 def _check_options(
     comparisons: Any, selection: str, fraction: float, test: Comparisons | None
 ) -> None:
-    if not isinstance(comparisons, Comparisons):
-        raise ValueError(f"comparisons must be Comparisons, got {type(comparisons).__name__}")
-    if test is not None and not isinstance(test, Comparisons):
-        raise ValueError(f"test must be Comparisons, got {type(test).__name__}")
+    instance("comparisons", comparisons, Comparisons)
+    if test is not None:
+        instance("test", test, Comparisons)
     if selection not in get_args(Selection):
         raise ValueError(f"selection must be one of {get_args(Selection)}, got {selection!r}")
     if (test is None) == (selection == "leaky_test_accuracy"):

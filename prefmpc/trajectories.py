@@ -12,6 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from prefmpc._checks import (
+    array_module,
     finite_array,
     instance,
     nonnegative,
@@ -19,6 +20,7 @@ from prefmpc._checks import (
     psd_matrix,
     require_x64,
     shaped,
+    to_numpy,
 )
 from prefmpc._pytree import bypass_init, check_index, register_pytree
 from prefmpc._random import generator
@@ -115,7 +117,7 @@ def second_moments(trajectory: Trajectory) -> Moments:
     instance("trajectory", trajectory, Trajectory)
     x = trajectory.x[..., :-1, :]
     u = trajectory.u
-    return Moments(jnp.einsum("...ki,...kj->...ij", x, x), jnp.einsum("...ki,...kj->...ij", u, u))
+    return Moments(x.swapaxes(-1, -2) @ x, u.swapaxes(-1, -2) @ u)
 
 
 def phi(trajectory: Trajectory, Q: ArrayLike, R: ArrayLike) -> Any:
@@ -129,7 +131,7 @@ def phi(trajectory: Trajectory, Q: ArrayLike, R: ArrayLike) -> Any:
     shaped("Q", Q, (trajectory.x.shape[-1],) * 2, "the trajectory's states")
     shaped("R", R, (trajectory.u.shape[-1],) * 2, "the trajectory's inputs")
     x, u = trajectory.x[..., :-1, :], trajectory.u
-    return jnp.einsum("...ki,ij,...kj->...", x, Q, x) + jnp.einsum("...ki,ij,...kj->...", u, R, u)
+    return ((x @ Q) * x).sum((-1, -2)) + ((u @ R) * u).sum((-1, -2))
 
 
 def rollout(
@@ -164,19 +166,28 @@ def rollout(
     starts = shaped("x0", finite_array("x0", x0), (system.nx,), "the system's states")
     steps = positive_int("steps", steps)
     batch = starts.shape[:-1]
-    flat = jnp.asarray(starts).reshape(-1, system.nx)
+    flat = starts.reshape(-1, system.nx)
     if callable(law):
         x, u = _rollout_law(system.A, system.B, flat, steps, law)
     else:
         K = shaped("law", finite_array("law", law), (system.nu, system.nx), "a gain K")
         if K.shape[:-2] not in ((), batch):
             raise ValueError(f"law must hold one gain or one for each x0 {batch}, got {K.shape}")
-        gains = jnp.broadcast_to(K, (*batch, system.nu, system.nx))
+        gains = array_module(K).broadcast_to(K, (*batch, system.nu, system.nx))
         x, u = _rollout_gain(
             system.A, system.B, flat, steps, gains.reshape(-1, system.nu, system.nx)
         )
-    x = x.reshape(*batch, steps + 1, system.nx)
-    u = u.reshape(*batch, steps, system.nu)
+    x, u = to_numpy((x, u))
+    return from_flat(system, x, u, batch)
+
+
+def from_flat(system: LinearSystem, x: Any, u: Any, batch: tuple[int, ...]) -> Trajectory:
+    """Build a trajectory from x and u with one leading dimension: give it the shape ``batch``.
+
+    The outputs are y = C x. Nothing is checked: a failed solve may have left NaN behind.
+    """
+    x = x.reshape(*batch, *x.shape[1:])
+    u = u.reshape(*batch, *u.shape[1:])
     return bypass_init(Trajectory, x=x, u=u, y=x[..., :-1, :] @ system.C.T)
 
 

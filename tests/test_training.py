@@ -427,13 +427,13 @@ LOSS = {"selection": "training_loss"}
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: fit(POOL, key=KEY), "comparisons must be Comparisons, got Trajectory"),
+        (lambda: fit(POOL, key=KEY), "comparisons must be a Comparisons, got Trajectory"),
         (lambda: fit(FEW, key=KEY, selection="best"), "selection must be one of .*got 'best'"),
         (lambda: fit(FEW, key=KEY, selection="leaky_test_accuracy"), "test must be given with"),
         (lambda: fit(FEW, key=KEY, test=FEW), "test must be given with .* and only then"),
         (
             lambda: fit(FEW, key=KEY, selection="leaky_test_accuracy", test=POOL),
-            "test must be Comparisons, got Trajectory",
+            "test must be a Comparisons, got Trajectory",
         ),
         (lambda: fit(FEW, key=KEY, validation_fraction=0), r"must lie in \(0, 1\), got 0"),
         (lambda: fit(FEW, key=KEY, validation_fraction=1.0), r"must lie in \(0, 1\), got 1"),

@@ -170,12 +170,12 @@ def broadcast_states(x0: Any, costs: int, stacked: bool, nx: int) -> tuple[Any, 
     if stacked and x0.ndim == 3:
         if x0.shape[0] != costs:
             raise ValueError(f"x0 must have {costs} rows of states, one a cost, got {x0.shape}")
-        return jnp.asarray(x0), (costs, x0.shape[1])
+        return x0, (costs, x0.shape[1])
     if x0.ndim > 2:
         raise ValueError(f"x0 must have shape ({nx},) or (m, {nx}), got {x0.shape}")
     lead = (costs, *x0.shape[:-1]) if stacked else x0.shape[:-1]
-    flat = jnp.asarray(x0).reshape(-1, nx)
-    return jnp.broadcast_to(flat, (costs, *flat.shape)), lead
+    flat = np.asarray(x0).reshape(-1, nx)
+    return np.broadcast_to(flat, (costs, *flat.shape)), lead
 
 
 @jax.jit(static_argnums=2)
