@@ -72,7 +72,8 @@ bench: $(STAMP)
 
 # In this order: the quick ones first.
 test: $(STAMP)
-	@$(MAKE) --no-print-directory lint types unit nbval html-strict test-html
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint types html-strict
+	@$(MAKE) --no-print-directory test-html unit nbval
 	@echo "All checks passed: lint, types, unit tests, notebooks, HTML."
 
 lint: $(STAMP)

@@ -17,13 +17,13 @@ os.environ["SOURCE_DATE_EPOCH"] = "0"
 os.environ["PYTHONPATH"] = os.pathsep.join(
     [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
 )
-# The same programs are compiled in many tests and notebooks: keep them between processes. A folder
-# for each worker, so that none reads what another is writing, and for each set of XLA's options.
-_setting = f"{os.environ.get('PYTEST_XDIST_WORKER', 'main')} {os.environ.get('XLA_FLAGS', '')}"
-os.environ.setdefault(
-    "JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax" / re.sub(r"\W+", "-", _setting))
-)
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+# The same programs are compiled in many tests and notebooks: keep them between processes, in a
+# folder for each set of XLA's options. Only a cache of limited size is locked while it is read or
+# written (with the package filelock), so that two processes can share it.
+_setting = re.sub(r"\W+", "-", "xla " + os.environ.get("XLA_FLAGS", ""))
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax" / _setting))
+os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(500_000_000))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
 
 
 import jax  # noqa: E402

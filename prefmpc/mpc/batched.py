@@ -40,15 +40,19 @@ class CondensedProblem(NamedTuple):
     upper: Any
 
 
+def responses(system: LinearSystem, horizon: int) -> tuple[Any, Any]:
+    """Return Φ (N, nx, nx) and Γ (N, nx, N·nu): x_k = Φ_k x_0 + Γ_k U for k = 0 … N−1."""
+    A, B = jnp.asarray(system.A), jnp.asarray(system.B)
+    _, Phi = jax.lax.scan(lambda P, _: (A @ P, P), jnp.eye(system.nx), None, length=horizon)
+    k = np.arange(horizon)
+    delay = k[:, None] - k - 1  # steps from u_j until x_k; negative: not yet
+    blocks = jnp.where(delay[..., None, None] >= 0, (Phi @ B)[np.maximum(delay, 0)], 0.0)
+    return Phi, blocks.swapaxes(1, 2).reshape(horizon, system.nx, horizon * system.nu)
+
+
 def condense(system: LinearSystem, cost: QuadraticCost, horizon: int) -> CondensedProblem:
     """Eliminate the states of eq. (12) of arXiv 2511.22502: a problem in the inputs alone."""
-    A, B = jnp.asarray(system.A), jnp.asarray(system.B)
-    nx, nu = system.nx, system.nu
-    power, response = [jnp.eye(nx)], [jnp.zeros((nx, horizon * nu))]
-    for k in range(horizon - 1):  # x_1 … x_{N−1}: σ does not weigh x_N
-        power.append(A @ power[-1])
-        response.append((A @ response[-1]).at[:, k * nu : (k + 1) * nu].add(B))
-    Phi, Gamma = jnp.stack(power), jnp.stack(response)  # (N, nx, nx), (N, nx, N·nu)
+    Phi, Gamma = responses(system, horizon)
     H = 2 * (
         jnp.einsum("kxi,xz,kzj->ij", Gamma, cost.Q, Gamma) + jnp.kron(jnp.eye(horizon), cost.R)
     )
