@@ -22,6 +22,8 @@ PYTHON ?= $(shell for p in python3.11 python3 python; do \
 	if $$p -c '$(RECENT)' >/dev/null 2>&1; then echo $$p; break; fi; done)
 
 export JAX_PLATFORMS ?= cpu
+# The matrices are small: threads would only wait for each other.
+export OPENBLAS_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: help book test lab notebooks bench clean lint types unit nbval html html-strict test-html

@@ -13,6 +13,7 @@ ROOT = Path(__file__).resolve().parent
 
 # Set before JAX is imported, here and in the notebooks' kernels, which inherit it.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads only wait
 os.environ["SOURCE_DATE_EPOCH"] = "0"
 os.environ["PYTHONPATH"] = os.pathsep.join(
     [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]

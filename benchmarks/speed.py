@@ -117,7 +117,7 @@ def main() -> None:
     print(f"import prefmpc after jax, optax and jaxopt: {extra:.3f} s (wanted: under 0.3 s)")
 
     cost = prefmpc.QuadraticCost(studies.QUADRATIC_Q, studies.QUADRATIC_R)
-    x0 = studies.random_states(studies.RADIUS, key=key, shape=(200,))
+    x0 = prefmpc.random_states(studies.RADIUS, key=key, shape=(200,))
     batched = median_seconds(lambda: prefmpc.closed_loops(system, cost, x0, horizon=10, steps=30))
     controller = prefmpc.LinearMPC(system, cost, 10)
     looped = median_seconds(lambda: prefmpc.simulate(system, controller, x0, 30), repeats=1)

@@ -5,22 +5,42 @@ choices, through P(T_i is preferred to T_j) = 1 / (1 + exp(σ(T_i) − σ(T_j)))
 objective of the controller.
 """
 
-from prefmpc.evaluation import ClosedLoops, accuracy, closed_loops, simulate
+from prefmpc.comparisons import Comparisons
+from prefmpc.evaluation import (
+    ClosedLoops,
+    WinRate,
+    accuracy,
+    closed_loops,
+    regret,
+    simulate,
+    win_rate,
+)
 from prefmpc.models import CostModel, QuadraticCost
 from prefmpc.mpc import BatchedMPC, LinearMPC, MPCError, MPCSolution
-from prefmpc.preferences import Comparisons, Preference, QuadraticPreference, one_by_one
+from prefmpc.pools import lqr_pool, random_states, random_weights
+from prefmpc.preferences import (
+    Criterion,
+    Preference,
+    QuadraticPreference,
+    SettlingTimePreference,
+    by_criterion,
+    erring,
+    lexicographic,
+    logistic,
+    one_by_one,
+)
 from prefmpc.sets import Polyhedron
 from prefmpc.systems import LinearSystem, oscillating_masses
 from prefmpc.training import FitError, FitResult, fit
 from prefmpc.trajectories import (
     Moments,
     Trajectory,
-    lqr_pool,
+    max_input,
     phi,
-    random_states,
-    random_weights,
     rollout,
     second_moments,
+    settling_text,
+    settling_time,
 )
 
 __version__ = "0.1.0"
@@ -30,6 +50,7 @@ __all__ = [
     "ClosedLoops",
     "Comparisons",
     "CostModel",
+    "Criterion",
     "FitError",
     "FitResult",
     "LinearMPC",
@@ -41,17 +62,28 @@ __all__ = [
     "Preference",
     "QuadraticCost",
     "QuadraticPreference",
+    "SettlingTimePreference",
     "Trajectory",
+    "WinRate",
     "accuracy",
+    "by_criterion",
     "closed_loops",
+    "erring",
     "fit",
+    "lexicographic",
+    "logistic",
     "lqr_pool",
+    "max_input",
     "one_by_one",
     "oscillating_masses",
     "phi",
     "random_states",
     "random_weights",
+    "regret",
     "rollout",
     "second_moments",
+    "settling_text",
+    "settling_time",
     "simulate",
+    "win_rate",
 ]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Callable
+from statistics import NormalDist
 from typing import Any
 
 import jax
@@ -13,10 +14,11 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from prefmpc._checks import function, instance, nonnegative, positive_int, to_numpy
+from prefmpc.comparisons import Comparisons
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc.batched import broadcast_states, condense, each_cost, solve_box
 from prefmpc.mpc.solution import check_problem, check_state
-from prefmpc.preferences import Comparisons
+from prefmpc.preferences import Preference
 from prefmpc.systems import LinearSystem
 from prefmpc.trajectories import Trajectory, from_flat
 
@@ -40,6 +42,131 @@ def accuracy(model: Callable[[Trajectory], Any], comparisons: Comparisons) -> fl
         raise ValueError("model must return finite costs, got NaN or infinite ones")
     first_wins = costs[comparisons.first] <= costs[comparisons.second]
     return float(np.where(first_wins, comparisons.labels, 1 - comparisons.labels).mean())
+
+
+def regret(
+    cost: Callable[[Trajectory], Any],
+    trajectories: Trajectory,
+    best: Trajectory | None = None,
+) -> np.ndarray:
+    """Return σ(T) − min σ over what is possible from the same x(0): what a controller gives away.
+
+    Parameters
+    ----------
+    cost : function of a batch of trajectories to numbers
+        The measure that counts: the person's own cost if it is known (never the learned one).
+    trajectories : Trajectory
+        Leading shape (..., m): closed loops of several controllers from the same m states.
+    best : Trajectory, optional
+        Leading shape (m,): the best that is possible from each state, for instance
+        ``BatchedMPC(system, person, horizon=steps).solve(x0).trajectory``. Default: the best
+        among ``trajectories``, over all leading axes but the last.
+
+    Returns
+    -------
+    array (..., m)
+
+    Raises
+    ------
+    ValueError
+        If the trajectories do not start in the same states: costs from different x(0) do not
+        compare.
+    """
+    function("cost", cost)
+    instance("trajectories", trajectories, Trajectory)
+    values = _costs(cost, trajectories)
+    if best is None:
+        if len(trajectories.batch_shape) < 2:
+            raise ValueError(
+                "trajectories must have shape (controllers, states) to find the best among them, "
+                f"got {trajectories.batch_shape}; or pass best"
+            )
+        _same_starts("trajectories", trajectories, trajectories[(0,) * (values.ndim - 1)])
+        return values - values.min(axis=tuple(range(values.ndim - 1)))
+    instance("best", best, Trajectory)
+    _same_starts("best", best, trajectories)
+    return values - _costs(cost, best)
+
+
+@dataclasses.dataclass(frozen=True)
+class WinRate:
+    """Share of initial states from which A is preferred to B, with its confidence interval.
+
+    Attributes
+    ----------
+    rate, low, high : float in [0, 1]
+    count : int
+        Number of initial states. The interval is about them: another draw of states, the same two
+        controllers.
+    """
+
+    rate: float
+    low: float
+    high: float
+    count: int
+
+    def __str__(self) -> str:
+        return f"{100 * self.rate:.0f} % [{100 * self.low:.0f}, {100 * self.high:.0f}]"
+
+
+def win_rate(
+    preference: Preference, first: Trajectory, second: Trajectory, *, confidence: float = 0.95
+) -> WinRate:
+    """Return how often Π prefers the closed loop of one controller to that of another.
+
+    Both orders are asked, and no difference (or no answer) counts half, so that a controller wins
+    against itself in half of the cases whatever Π says about equal ones. The interval is Wilson's.
+
+    Parameters
+    ----------
+    first, second : Trajectory
+        Leading shape (m,): closed loops of controllers A and B from the same m states.
+
+    Raises
+    ------
+    ValueError
+        If the trajectories do not start in the same states, or ``confidence`` is not in (0, 1).
+    """
+    function("preference", preference)
+    for name, value in {"first": first, "second": second}.items():
+        instance(name, value, Trajectory)
+        if len(value.batch_shape) != 1:
+            raise ValueError(f"{name} must have shape (m,), got {value.batch_shape}")
+    _same_starts("second", second, first)
+    if not 0 < nonnegative("confidence", confidence) < 1:
+        raise ValueError(f"confidence must lie in (0, 1), got {confidence}")
+    count = len(first)
+    answers = np.array([preference(first, second), preference(second, first)], dtype=np.float64)
+    if answers.shape != (2, count) or ((answers < 0) | (answers > 1)).any():
+        raise ValueError(
+            f"preference must return {count} answers in [0, 1], got shape {answers.shape[1:]}"
+            + (f" with {answers}" if answers.size < 20 else "")
+        )
+    wins, losses = np.nan_to_num(answers, nan=0.5)
+    rate = float((wins + 1 - losses).mean() / 2)
+    z = NormalDist().inv_cdf((1 + confidence) / 2)
+    centre = (rate + z**2 / (2 * count)) / (1 + z**2 / count)
+    half = z / (1 + z**2 / count) * np.sqrt(rate * (1 - rate) / count + z**2 / (4 * count**2))
+    return WinRate(rate, float(max(centre - half, 0)), float(min(centre + half, 1)), count)
+
+
+def _costs(cost: Callable[[Trajectory], Any], trajectories: Trajectory) -> np.ndarray:
+    values = np.asarray(cost(trajectories))
+    if values.shape != trajectories.batch_shape or not np.isfinite(values).all():
+        raise ValueError(
+            f"cost must return one finite number a trajectory {trajectories.batch_shape}, "
+            f"got shape {values.shape}"
+        )
+    return values
+
+
+def _same_starts(name: str, trajectory: Trajectory, other: Trajectory) -> None:
+    a, b = np.asarray(trajectory.x[..., 0, :]), np.asarray(other.x[..., 0, :])
+    if a.shape[-2:] != b.shape[-2:] or not np.allclose(a, b, rtol=1e-9, atol=1e-12):
+        raise ValueError(
+            f"{name} must start in the same states as what it is compared with: "
+            "costs from different x(0) do not compare"
+        )
 
 
 def simulate(

@@ -11,7 +11,8 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import array_module, instance, psd_matrix, require_x64, shaped
 from prefmpc._pytree import bypass_init, check_index, register_pytree
-from prefmpc.trajectories import Trajectory, random_weights, second_moments
+from prefmpc.pools import random_weights
+from prefmpc.trajectories import Trajectory, second_moments
 
 DIAGONAL_MIN = 0.01
 FIRST_MIN = 1.0
@@ -154,7 +155,7 @@ class QuadraticCost:
     def random(
         cls, nx: int, nu: int, *, key: Any, shape: tuple[int, ...] = (), **options: float
     ) -> QuadraticCost:
-        """Draw a stack of models with `prefmpc.trajectories.random_weights` (same options)."""
+        """Draw a stack of models with `prefmpc.pools.random_weights` (same options)."""
         require_x64()
         return cls(*random_weights(nx, nu, key=key, shape=shape, **options))
 

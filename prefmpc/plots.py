@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -147,3 +147,27 @@ def heatmaps(matrices: Mapping[str, ArrayLike], names: Sequence[str] = ()) -> Fi
         ax.set_yticks(ticks, list(names))
     figure.colorbar(image, ax=np.atleast_1d(axes).tolist(), shrink=0.85)
     return figure
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[Any]], caption: str) -> Any:
+    """Return an HTML table for a notebook (needs IPython) of texts, which may hold HTML."""
+    from IPython.display import HTML
+
+    def line(tag: str, row: Sequence[Any]) -> str:
+        return "<tr>" + "".join(f"<{tag}>{cell}</{tag}>" for cell in row) + "</tr>"
+
+    body = "".join(line("td", row) for row in rows)
+    return HTML(
+        f"<table><caption>{caption}</caption><thead>{line('th', head)}</thead>"
+        f"<tbody>{body}</tbody></table>"
+    )
+
+
+def mark(value: float, low: float, high: float, digits: int = 0, text: str | None = None) -> str:
+    """Return a number for `table`, marked as inside or outside of a range.
+
+    The range is widened by half a unit of the last digit, to which ``value`` was rounded.
+    """
+    edge = 0.5 * 10.0**-digits
+    word = "inside" if low - edge <= value <= high + edge else "outside"
+    return f'<span class="{word}">{f"{value:.{digits}f}" if text is None else text}</span>'

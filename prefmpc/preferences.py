@@ -1,26 +1,27 @@
-"""Preferences Π over pairs of trajectories, and the data they leave behind: `Comparisons`."""
+"""Preferences Π over pairs of trajectories: simulated people, and tools to put them together.
+
+A preference is any function of two batches of trajectories that returns P(first is preferred) for
+each pair: 1 the first, 0 the second, 0.5 no difference, NaN no answer (such a pair is left out of
+a data set).
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import os
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, function, positive_int, psd_matrix
-from prefmpc._random import generator
-from prefmpc.trajectories import Trajectory, phi
+from prefmpc._checks import function, nonnegative, psd_matrix
+from prefmpc.trajectories import Trajectory, max_input, phi, settling_time
 
 Preference = Callable[[Trajectory, Trajectory], Any]
 """Π: two batches of trajectories → P(first is preferred) ∈ [0, 1], one number for each pair."""
 
-_FORMAT_VERSION = 1
+Criterion = Callable[[Trajectory], Any]
+"""A number for each trajectory of a batch (...), smaller is better; infinite is worst."""
 
 
 class QuadraticPreference:
@@ -45,12 +46,135 @@ class QuadraticPreference:
         return np.asarray(better, dtype=np.float64)
 
 
+class SettlingTimePreference:
+    """Π_κ: prefers the trajectory whose output settles first, ‖y‖₂ ≤ ε from then on.
+
+    Implements the preference of section III-B of arXiv 2511.22502. A trajectory that never settles
+    loses against every one that does.
+
+    Parameters
+    ----------
+    epsilon : float
+        ε, in the unit of the output.
+    tie_break : {"max_input", None}
+        "max_input": among equal settling times the smaller max‖u‖∞ wins, and equal ones give 1.
+        (The paper's text; its formula has the arguments of Π_u swapped.) None: there is no winner.
+    ties : {"half", "drop"}
+        What to answer without a winner: 0.5, or NaN, so that the pair is left out of the data.
+    """
+
+    def __init__(
+        self,
+        epsilon: float = 0.1,
+        tie_break: Literal["max_input"] | None = "max_input",
+        ties: Literal["half", "drop"] = "half",
+    ) -> None:
+        self.epsilon = nonnegative("epsilon", epsilon)
+        if tie_break not in ("max_input", None):
+            raise ValueError(f'tie_break must be "max_input" or None, got {tie_break!r}')
+        if ties not in ("half", "drop"):
+            raise ValueError(f'ties must be "half" or "drop", got {ties!r}')
+        self.tie_break, self.ties = tie_break, ties
+
+    def __call__(self, first: Trajectory, second: Trajectory) -> np.ndarray:
+        """Return P(first is preferred) ∈ {0, 0.5, 1}, or NaN for a dropped pair; shape (...)."""
+        answer = _smaller(
+            settling_time(first, self.epsilon), settling_time(second, self.epsilon), 0.0
+        )
+        if self.tie_break == "max_input":
+            spared = np.asarray(max_input(first) <= max_input(second), dtype=np.float64)
+            return np.where(answer == 0.5, spared, answer)
+        return np.where(answer == 0.5, np.nan, answer) if self.ties == "drop" else answer
+
+
+def by_criterion(criterion: Criterion, tolerance: float = 0.0) -> Preference:
+    """Return the preference for the smaller ``criterion``; no difference within ``tolerance``.
+
+    Parameters
+    ----------
+    criterion : function of a batch of trajectories (...) to numbers (...)
+        Smaller is better, infinite is worst. For instance `settling_time` or `max_input`.
+    tolerance : float
+        Differences up to it are not noticed: the answer is 0.5.
+    """
+    function("criterion", criterion)
+    tolerance = nonnegative("tolerance", tolerance)
+
+    def preference(first: Trajectory, second: Trajectory) -> np.ndarray:
+        return _smaller(_judge(criterion, first), _judge(criterion, second), tolerance)
+
+    return preference
+
+
+def lexicographic(*preferences: Preference) -> Preference:
+    """Return the preference that asks one after another until one of them decides.
+
+    "Settle first, then effort" is
+    ``lexicographic(by_criterion(settling_time), by_criterion(max_input))``.
+    The next one is asked about the pairs to which all before it answered 0.5 or NaN; if none
+    decides, the last answer stands.
+    """
+    if not preferences:
+        raise ValueError("preferences must hold at least one preference, got none")
+    for i, preference in enumerate(preferences):
+        function(f"preferences[{i}]", preference)
+
+    def combined(first: Trajectory, second: Trajectory) -> np.ndarray:
+        if not first.batch_shape:
+            pair = (jax.tree.map(lambda leaf: leaf[None], side) for side in (first, second))
+            return combined(*pair)[0]
+        answer = np.array(preferences[0](first, second), dtype=np.float64)
+        for preference in preferences[1:]:
+            undecided = np.nonzero((answer == 0.5) | np.isnan(answer))
+            if undecided[0].size:
+                answer[undecided] = preference(first[undecided], second[undecided])
+        return answer
+
+    return combined
+
+
+def erring(preference: Preference, rate: float) -> Preference:
+    """Return the preference of somebody who gives the wrong answer with probability ``rate``.
+
+    The result is a probability: P becomes (1 − rate)·P + rate·(1 − P). `Comparisons.sampled`
+    turns probabilities into answers.
+    """
+    function("preference", preference)
+    if not nonnegative("rate", rate) <= 1:
+        raise ValueError(f"rate must lie in [0, 1], got {rate}")
+
+    def noisy(first: Trajectory, second: Trajectory) -> np.ndarray:
+        answer = np.asarray(preference(first, second), dtype=np.float64)
+        return (1 - rate) * answer + rate * (1 - answer)
+
+    return noisy
+
+
+def logistic(criterion: Criterion, scale: float) -> Preference:
+    """Return the preference of somebody who is unsure where two trajectories are nearly as good.
+
+    P = 1 / (1 + exp((criterion(first) − criterion(second)) / scale)), the response model of
+    eq. (4) of arXiv 2511.22502 (Bradley and Terry): at a difference of ``scale`` the better one
+    is chosen with 73 %.
+    """
+    function("criterion", criterion)
+    if not nonnegative("scale", scale) > 0:
+        raise ValueError(f"scale must be positive, got {scale}")
+
+    def preference(first: Trajectory, second: Trajectory) -> np.ndarray:
+        a, b = _judge(criterion, first), _judge(criterion, second)
+        with np.errstate(invalid="ignore", over="ignore"):
+            gap = np.where(a == b, 0.0, (a - b) / scale)
+        return 0.5 * (1 - np.tanh(gap / 2))
+
+    return preference
+
+
 def one_by_one(ask: Callable[[Trajectory, Trajectory], float]) -> Preference:
     """Turn a function that judges one pair at a time into a preference over batches.
 
     For anything that cannot be vectorised: a lookup, a simulation, a question to a person.
     """
-
     function("ask", ask)
 
     def preference(first: Trajectory, second: Trajectory) -> np.ndarray:
@@ -63,218 +187,17 @@ def one_by_one(ask: Callable[[Trajectory, Trajectory], float]) -> Preference:
     return preference
 
 
-@dataclasses.dataclass(frozen=True, eq=False, init=False)
-class Comparisons:
-    """A data set D of compared pairs: who was shown against whom, and what was answered.
-
-    Parameters
-    ----------
-    trajectories : Trajectory
-        With leading dimension n_t.
-    first, second : int array (n,)
-        Which trajectories stand in each pair.
-    labels : array (n,)
-        P(first is preferred) in [0, 1]: 1 first, 0 second, 0.5 cannot say.
-
-    Raises
-    ------
-    ValueError
-        If there is no pair, an index points nowhere, or a label lies outside [0, 1].
-    """
-
-    trajectories: Trajectory
-    first: np.ndarray
-    second: np.ndarray
-    labels: np.ndarray
-
-    def __init__(
-        self, trajectories: Trajectory, first: ArrayLike, second: ArrayLike, labels: ArrayLike
-    ) -> None:
-        _check_pool(trajectories)
-        labels = np.asarray(finite_array("labels", labels, ndim=1))
-        if labels.size == 0:
-            raise ValueError("labels must hold at least one comparison, got an empty data set")
-        if labels.min() < 0 or labels.max() > 1:
-            i = int(np.flatnonzero((labels < 0) | (labels > 1))[0])
-            raise ValueError(
-                f"labels must lie in [0, 1] (P(first is preferred)), got {labels[i]:g} at index {i}"
-            )
-        values: dict[str, Any] = {
-            "trajectories": trajectories,
-            "first": _pair_indices("first", first, labels.size, len(trajectories)),
-            "second": _pair_indices("second", second, labels.size, len(trajectories)),
-            "labels": labels,
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
-
-    def __len__(self) -> int:
-        """Number of comparisons n_p."""
-        return int(self.labels.size)
-
-    @property
-    def pairs(self) -> tuple[Trajectory, Trajectory]:
-        """The first and the second trajectory of every pair, each with leading dimension n_p."""
-        return self.trajectories[self.first], self.trajectories[self.second]
-
-    @classmethod
-    def random(
-        cls, trajectories: Trajectory, preference: Preference, size: int, *, key: Any
-    ) -> Comparisons:
-        """Draw ``size`` random pairs of two different trajectories and ask ``preference``.
-
-        Pairs are drawn independently, so that one may come up twice. ``preference`` is called
-        once, with two batches; wrap a function of single pairs in `one_by_one`.
-        """
-        _check_pool(trajectories)
-        size = positive_int("size", size)
-        count = len(trajectories)
-        if count < 2:
-            raise ValueError(f"trajectories must hold at least two to compare, got {count}")
-        rng = generator(key)
-        first = rng.integers(0, count, size)
-        gap = rng.integers(1, count, size)
-        second = (first + gap) % count
-        labels = np.asarray(preference(trajectories[first], trajectories[second]))
-        if labels.shape != (size,):
-            raise ValueError(
-                f"preference must return one label for each of the {size} pairs, got shape "
-                f"{labels.shape}; a function of single pairs needs one_by_one(...)"
-            )
-        return cls(trajectories, first, second, labels)
-
-    @classmethod
-    def from_arrays(
-        cls,
-        x_first: ArrayLike,
-        u_first: ArrayLike,
-        x_second: ArrayLike,
-        u_second: ArrayLike,
-        labels: ArrayLike,
-        *,
-        y_first: ArrayLike | None = None,
-        y_second: ArrayLike | None = None,
-    ) -> Comparisons:
-        """Build a data set from your own recordings: plain arrays and labels.
-
-        Parameters
-        ----------
-        x_first, x_second : array (n, N + 1, nx)
-        u_first, u_second : array (n, N, nu)
-        labels : array (n,)
-            P(first is preferred): 1 first, 0 second, 0.5 cannot say.
-        y_first, y_second : array (n, N, ny), optional
-        """
-        first = Trajectory(x_first, u_first, y_first)
-        second = Trajectory(x_second, u_second, y_second)
-        shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(side)] for side in (first, second)]
-        if len(first.batch_shape) != 1 or shapes[0] != shapes[1]:
-            raise ValueError(
-                "first and second must have equal shapes with one leading dimension, got x "
-                f"{np.shape(first.x)} and {np.shape(second.x)}, u {np.shape(first.u)} and "
-                f"{np.shape(second.u)}, y {np.shape(first.y)} and {np.shape(second.y)}"
-            )
-        n = len(first)
-        both = jax.tree.map(lambda a, b: np.concatenate([a, b]), first, second)
-        return cls(both, np.arange(n), np.arange(n, 2 * n), labels)
-
-    def subset(self, index: ArrayLike) -> Comparisons:
-        """Return the comparisons chosen by an integer or boolean index, in that order."""
-        chosen = np.asarray(index)
-        n = len(self)
-        if chosen.dtype == bool:
-            fits = chosen.shape == (n,)
-        else:
-            whole = chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)
-            fits = whole and chosen.ndim == 1 and bool(((chosen >= -n) & (chosen < n)).all())
-            chosen = chosen.astype(int) if fits else chosen
-        if not fits:
-            raise ValueError(f"index must choose among the {n} comparisons, got {chosen}")
-        return Comparisons(
-            self.trajectories, self.first[chosen], self.second[chosen], self.labels[chosen]
-        )
-
-    def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
-        """Write everything to one ``.npz`` file; an interrupted write leaves an old file whole.
-
-        Raises a FileExistsError if ``path`` exists and ``overwrite`` is False, and a ValueError
-        if it does not end in ``.npz``.
-        """
-        target = Path(path)
-        if target.suffix != ".npz":
-            raise ValueError(f"path must end in .npz, got {str(path)!r}")
-        if target.exists() and not overwrite:
-            raise FileExistsError(f"{target} exists; pass overwrite=True to replace it")
-        handle, temporary = tempfile.mkstemp(dir=target.parent, suffix=".npz.part")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(
-                    file,
-                    format_version=np.asarray(_FORMAT_VERSION),
-                    x=np.asarray(self.trajectories.x),
-                    u=np.asarray(self.trajectories.u),
-                    y=np.asarray(self.trajectories.y),
-                    first=self.first,
-                    second=self.second,
-                    labels=self.labels,
-                )
-                file.flush()
-                os.fsync(file.fileno())
-            # mkstemp makes the file private; a data set gets the permissions of any new file.
-            mask = os.umask(0)
-            os.umask(mask)
-            os.chmod(temporary, 0o666 & ~mask)
-            os.replace(temporary, target)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
-        return target
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str]) -> Comparisons:
-        """Read a file that `save` wrote; a ValueError says what is wrong with any other file."""
-        try:
-            with np.load(Path(path), allow_pickle=False) as file:
-                stored = {name: file[name] for name in file.files}
-        except FileNotFoundError:
-            raise
-        except Exception as error:
-            raise ValueError(f"path must be a readable .npz file, got {path}: {error}") from None
-        wanted = {"format_version", "x", "u", "y", "first", "second", "labels"}
-        if missing := sorted(wanted - stored.keys()):
-            raise ValueError(f"path must be a file of saved comparisons, {path} lacks {missing}")
-        version = stored["format_version"]
-        if version.shape != () or version != _FORMAT_VERSION:
-            raise ValueError(
-                f"path must hold format version {_FORMAT_VERSION}, got {version} in {path}"
-            )
-        trajectories = Trajectory(stored["x"], stored["u"], stored["y"])
-        return cls(trajectories, stored["first"], stored["second"], stored["labels"])
+def _smaller(a: Any, b: Any, tolerance: float) -> np.ndarray:
+    """1 where a is smaller, 0 where b is, 0.5 within the tolerance; two infinite ones are equal."""
+    a, b = np.asarray(a), np.asarray(b)
+    return np.where(a < b - tolerance, 1.0, np.where(a > b + tolerance, 0.0, 0.5))
 
 
-def _check_pool(trajectories: Any) -> None:
-    if not isinstance(trajectories, Trajectory):
+def _judge(criterion: Criterion, trajectory: Trajectory) -> np.ndarray:
+    values = np.asarray(criterion(trajectory), dtype=np.float64)
+    if values.shape != trajectory.batch_shape or np.isnan(values).any():
         raise ValueError(
-            f"trajectories must be a Trajectory, got {type(trajectories).__name__}; "
-            "from plain arrays: Comparisons.from_arrays"
+            f"criterion must return one number a trajectory {trajectory.batch_shape}, "
+            f"got shape {values.shape}" + (" with NaN" if np.isnan(values).any() else "")
         )
-    if len(trajectories.batch_shape) != 1:
-        raise ValueError(
-            "trajectories must have one leading dimension (n_t trajectories), "
-            f"got batch shape {trajectories.batch_shape}"
-        )
-
-
-def _pair_indices(name: str, value: ArrayLike, size: int, count: int) -> np.ndarray:
-    index = np.asarray(value)
-    if index.shape != (size,) or not np.issubdtype(index.dtype, np.integer):
-        raise ValueError(
-            f"{name} must hold {size} whole numbers, one for each label, "
-            f"got shape {index.shape} of {index.dtype}"
-        )
-    if index.min() < 0 or index.max() >= count:
-        raise ValueError(
-            f"{name} must point into the {count} trajectories (0 to {count - 1}), "
-            f"got {index.min()} to {index.max()}"
-        )
-    return index
+    return values

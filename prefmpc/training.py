@@ -16,8 +16,8 @@ import optax
 from prefmpc._checks import instance, nonnegative, positive_int, require_x64, to_numpy
 from prefmpc._lbfgsb import minimise
 from prefmpc._random import generator
+from prefmpc.comparisons import Comparisons
 from prefmpc.models import CostModel, QuadraticCost
-from prefmpc.preferences import Comparisons
 
 Selection = Literal["validation", "training_loss", "leaky_test_accuracy"]
 Status = Literal["converged", "max_iterations", "out_of_bounds", "not_finite"]

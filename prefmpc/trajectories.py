@@ -18,12 +18,10 @@ from prefmpc._checks import (
     nonnegative,
     positive_int,
     psd_matrix,
-    require_x64,
     shaped,
     to_numpy,
 )
 from prefmpc._pytree import bypass_init, check_index, register_pytree
-from prefmpc._random import generator
 from prefmpc.systems import LinearSystem
 
 
@@ -134,6 +132,46 @@ def phi(trajectory: Trajectory, Q: ArrayLike, R: ArrayLike) -> Any:
     return ((x @ Q) * x).sum((-1, -2)) + ((u @ R) * u).sum((-1, -2))
 
 
+def max_input(trajectory: Trajectory) -> Any:
+    """Return max_k ‖u_k‖∞, shape (...): the largest input of any channel, in its unit."""
+    instance("trajectory", trajectory, Trajectory)
+    return abs(trajectory.u).max((-2, -1))
+
+
+def settling_time(trajectory: Trajectory | ArrayLike, epsilon: float = 0.1) -> np.ndarray:
+    """Return κ_ε, the first step from which ‖y‖₂ ≤ ε for good, shape (...); inf if there is none.
+
+    Implements the settling time of section III-B of arXiv 2511.22502 on y_0 … y_{N−1}: κ = 0 if
+    the output never leaves the ball, and κ = inf if it is still outside at the last step.
+
+    Parameters
+    ----------
+    trajectory : Trajectory, or array of outputs (..., N, ny)
+        An output that is not finite is outside the ball.
+    epsilon : float
+        Radius of the ball, in the unit of y. Its border belongs to it.
+    """
+    if isinstance(trajectory, Trajectory):
+        y = np.asarray(trajectory.y)
+    else:
+        y = np.asarray(shaped("outputs", finite_array("outputs", trajectory), (None, None)))
+    steps = y.shape[-2]
+    if steps < 1:
+        raise ValueError(f"outputs must hold at least one step, got shape {y.shape}")
+    with np.errstate(over="ignore"):  # an infinite norm is outside
+        outside = ~(np.linalg.norm(y, axis=-1) <= nonnegative("epsilon", epsilon))
+    since = np.argmax(outside[..., ::-1], axis=-1)  # steps since it was last outside
+    kappa = np.where(outside.any(axis=-1), steps - since, 0)
+    return np.where(kappa == steps, np.inf, kappa)
+
+
+def settling_text(kappa: ArrayLike, steps: int) -> str:
+    """Return a settling time in steps as text: "7", "6.5", or ">30" if it never settled."""
+    if np.ndim(kappa) or np.isnan(value := float(finite_array("kappa", kappa, allow_inf=True))):
+        raise ValueError(f"kappa must be one settling time, got {kappa!r}")
+    return f">{positive_int('steps', steps)}" if np.isinf(value) else f"{value:g}"
+
+
 def rollout(
     system: LinearSystem,
     x0: ArrayLike,
@@ -211,82 +249,3 @@ def _rollout_law(A: Any, B: Any, x0: Any, steps: int, law: Callable[[Any], Any])
 @jax.jit(static_argnums=3)
 def _rollout_gain(A: Any, B: Any, x0: Any, steps: int, K: Any) -> Any:
     return jax.vmap(lambda start, gain: _scan(A, B, start, steps, lambda x: -gain @ x))(x0, K)
-
-
-def random_weights(
-    nx: int,
-    nu: int,
-    *,
-    key: Any,
-    shape: tuple[int, ...] = (),
-    low: float = 0.1,
-    high: float = 10.0,
-    coupling: float = 0.1,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Draw predominantly diagonal weights Q ``(*shape, nx, nx)`` and R ``(*shape, nu, nu)``.
-
-    Each is MᵀM/2 + diag(U[low, high]) with M = ``coupling`` · standard normal. The paper (section
-    III-A) says "predominantly diagonal, with diagonal elements in [0.1, 10]" and no more; this
-    reading gives its row "Random" of Table I.
-    """
-    require_x64()
-    nx, nu = positive_int("nx", nx), positive_int("nu", nu)
-    if not 0 < nonnegative("low", low) < nonnegative("high", high):
-        raise ValueError(f"low and high must satisfy 0 < low < high, got {low} and {high}")
-    nonnegative("coupling", coupling)
-    rng = generator(key)
-
-    def draw(n: int) -> np.ndarray:
-        M = coupling * rng.standard_normal((*shape, n, n))
-        d = rng.uniform(low, high, (*shape, n))
-        return np.swapaxes(M, -1, -2) @ M / 2 + d[..., None] * np.eye(n)
-
-    return draw(nx), draw(nu)
-
-
-def random_states(radius: ArrayLike, *, key: Any, shape: tuple[int, ...] = ()) -> np.ndarray:
-    """Draw states ``(*shape, nx)``, each entry uniform in [−radius, radius]; radius is (nx,)."""
-    radius = np.asarray(finite_array("radius", radius, ndim=1))
-    if (radius < 0).any():
-        raise ValueError(f"radius must not be negative, got {radius}")
-    return generator(key).uniform(-1.0, 1.0, (*shape, radius.size)) * radius
-
-
-def lqr_pool(
-    system: LinearSystem,
-    size: int,
-    steps: int,
-    *,
-    key: Any,
-    radius: ArrayLike,
-    weights: tuple[ArrayLike, ArrayLike] | None = None,
-) -> Trajectory:
-    """Simulate ``size`` closed loops, each with its own random x(0) and its own random LQR.
-
-    This is how the paper (section III-A) makes the trajectories that people compare.
-
-    Parameters
-    ----------
-    radius : array (nx,)
-        x(0) is uniform in [−radius, radius].
-    weights : (Q, R), optional
-        Stacks (size, nx, nx) and (size, nu, nu) of LQR weights; default: `random_weights`.
-
-    Returns
-    -------
-    Trajectory
-        With leading dimension ``size``.
-    """
-    instance("system", system, LinearSystem)
-    size = positive_int("size", size)
-    rng = generator(key)
-    if weights is None:
-        Q, R = random_weights(system.nx, system.nu, key=rng, shape=(size,))
-    else:
-        Q = np.asarray(finite_array("weights[0]", weights[0], ndim=3))
-        R = np.asarray(finite_array("weights[1]", weights[1], ndim=3))
-        if len(Q) != size or len(R) != size:
-            raise ValueError(f"weights must hold {size} matrices each, got {len(Q)} and {len(R)}")
-    gains = np.stack([system.lqr(q, r)[0] for q, r in zip(Q, R, strict=True)])
-    x0 = random_states(radius, key=rng, shape=(size,))
-    return rollout(system, x0, gains, steps)

@@ -1,4 +1,4 @@
-"""Accuracy by hand; closed loops in one compiled call against one solve at a time."""
+"""Accuracy, regret and shares of wins by hand; closed loops against one solve at a time."""
 
 from __future__ import annotations
 
@@ -6,20 +6,28 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from prefmpc import (
+    BatchedMPC,
     Comparisons,
     LinearMPC,
     LinearSystem,
     MPCError,
     Polyhedron,
     QuadraticCost,
+    QuadraticPreference,
     Trajectory,
+    WinRate,
     accuracy,
+    by_criterion,
     closed_loops,
     oscillating_masses,
     random_states,
+    regret,
     simulate,
+    win_rate,
 )
 from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
@@ -36,6 +44,97 @@ def test_accuracy_by_hand():
     assert accuracy(lambda T: np.array([1.0, 2, 3, 2]), ASKED) == pytest.approx(1.7 / 5)
     # Equal costs count as "first": 1 + 0 + 0.5 + 0.8 + 1.
     assert accuracy(lambda T: jnp.zeros(4), ASKED) == pytest.approx(3.3 / 5)
+
+
+def runs(costs, start=0.0):
+    """Trajectories (..., m) of one step with these costs; state i starts at ``start`` + i."""
+    costs = np.asarray(costs, float)
+    x = np.zeros((*costs.shape, 2, 1))
+    x[..., 0, 0] = start + np.arange(costs.shape[-1])
+    return Trajectory(x, costs[..., None, None])
+
+
+def effort(T):
+    return T.u[..., 0, 0]
+
+
+def test_regret_by_hand():
+    controllers = runs([[3, 1], [2, 5], [4, 1]])  # the best from each state: 2 and 1
+    lost = regret(effort, controllers)
+    np.testing.assert_array_equal(lost, [[1, 0], [0, 4], [2, 0]])
+    best = runs([1, 0.5])
+    expected = [[2, 0.5], [1, 4.5], [3, 0.5]]
+    np.testing.assert_array_equal(regret(effort, controllers, best), expected)
+    np.testing.assert_array_equal(regret(effort, controllers[1], best), expected[1])
+    np.testing.assert_array_equal(regret(effort, best, best), [0, 0])
+    # Two kinds of three controllers: the best is that of all six.
+    nested = runs([[[3, 1], [2, 5], [4, 1]], [[9, 9], [1, 9], [9, 0]]])
+    np.testing.assert_array_equal(
+        regret(effort, nested), [[[2, 1], [1, 5], [3, 1]], [[8, 9], [0, 9], [8, 0]]]
+    )
+
+
+def test_equal_starts_may_differ_by_rounding():
+    nearly = runs([3, 1], start=1e-14)
+    np.testing.assert_array_equal(regret(effort, nearly, runs([1, 1])), [2, 0])
+    assert win_rate(by_criterion(effort), nearly, runs([1, 1])).rate == 0.25
+
+
+def prefers_less(first, second):
+    """No difference counts for the first, like Π_φ."""
+    return np.where(effort(first) <= effort(second), 1.0, 0.0)
+
+
+@pytest.mark.parametrize("equal", [0.0, 0.5, 1.0, np.nan])
+def test_nobody_wins_against_itself(equal):
+    result = win_rate(lambda a, b: np.full(len(a), equal), runs([1, 2, 3]), runs([1, 2, 3]))
+    assert result.rate == 0.5
+    assert result.count == 3
+    assert result.low == pytest.approx(1 - result.high)
+
+
+def test_shares_of_wins_by_hand():
+    # One win, one draw, two losses.
+    ours, theirs = runs([1, 2, 3, 4]), runs([2, 2, 2, 2])
+    assert win_rate(prefers_less, ours, theirs).rate == pytest.approx(1.5 / 4)
+    assert win_rate(prefers_less, theirs, ours).rate == pytest.approx(2.5 / 4)
+    assert win_rate(by_criterion(effort), ours, theirs).rate == pytest.approx(1.5 / 4)
+
+    def drops_ties(first, second):
+        answer = by_criterion(effort)(first, second)
+        return np.where(answer == 0.5, np.nan, answer)
+
+    dropped = win_rate(drops_ties, ours, theirs)
+    assert (dropped.rate, dropped.count) == (pytest.approx(1.5 / 4), 4)
+    # Somebody who is unsure: 0.7 in one order, 0.3 in the other.
+    unsure = win_rate(lambda a, b: np.where(effort(a) < effort(b), 0.7, 0.3), ours, runs([9] * 4))
+    assert unsure.rate == pytest.approx(0.7)
+
+
+def test_wilson_s_interval():
+    # z = 1.96: (0.8 + z²/20 ± z·√(0.8·0.2/10 + z²/400)) / (1 + z²/10) = 0.7167 ± 0.2266
+    ours, theirs = runs([0] * 8 + [2] * 2), runs([1] * 10)
+    eight = win_rate(prefers_less, ours, theirs)
+    assert (eight.rate, eight.count) == (0.8, 10)
+    assert eight.low == pytest.approx(0.4902, abs=5e-5)
+    assert eight.high == pytest.approx(0.9433, abs=5e-5)
+    assert str(eight) == "80 % [49, 94]"
+    assert str(WinRate(1.0, 0.722, 1.0, 10)) == "100 % [72, 100]"
+    # z = 1 (68.27 %): (0.85 ± √(0.016 + 0.0025)) / 1.1
+    narrow = win_rate(prefers_less, ours, theirs, confidence=0.6826895)
+    assert narrow.low == pytest.approx((0.85 - np.sqrt(0.0185)) / 1.1, abs=1e-6)
+    assert narrow.high == pytest.approx((0.85 + np.sqrt(0.0185)) / 1.1, abs=1e-6)
+
+
+@given(st.lists(st.booleans(), min_size=1, max_size=40))
+def test_the_borders_of_the_interval_are_just_not_rejected(won):
+    result = win_rate(prefers_less, runs(1 - np.array(won)), runs([0.5] * len(won)))
+    rate, n = np.mean(won), len(won)
+    assert result.rate == pytest.approx(rate)
+    assert 0 <= result.low <= rate <= result.high <= 1
+    for p in (result.low, result.high):
+        # The score test: |rate − p| = z·√(p (1 − p) / n).
+        assert (rate - p) ** 2 == pytest.approx(1.959964**2 * p * (1 - p) / n, abs=1e-6)
 
 
 def test_simulate_by_hand():
@@ -79,6 +178,25 @@ def test_closed_loops_are_those_of_linear_mpc(stacked):
     assert_equal_loops(own.trajectories[1][::-1], single[1])
 
 
+def test_no_closed_loop_beats_the_optimum(stacked):
+    costs, x0, single = stacked
+    best = BatchedMPC(MASSES, PAPER, 12).solve(x0)
+    fast = closed_loops(MASSES, costs, x0, horizon=10, steps=12).trajectories
+    for loops in (fast, single[0], single[1]):
+        lost = regret(PAPER, loops, best.trajectory)
+        assert lost.shape == loops.batch_shape
+        assert (lost >= -1e-9).all()
+    lost = regret(PAPER, fast, best.trajectory)
+    # The person's own controller sees 10 steps of 12; the other minimises something else.
+    assert (lost[0] < 0.01 * best.cost).all()
+    assert lost[0].mean() < lost[1].mean()
+    np.testing.assert_array_equal(regret(PAPER, best.trajectory, best.trajectory), 0)
+    np.testing.assert_allclose(regret(PAPER, fast), lost - lost.min(0), atol=1e-9)
+    person = QuadraticPreference(QUADRATIC_Q, QUADRATIC_R)
+    assert win_rate(person, best.trajectory, fast[1]).rate == 1
+    assert win_rate(person, fast[0], fast[1]).rate == pytest.approx((lost[0] < lost[1]).mean())
+
+
 def test_a_single_cost_has_no_leading_axis(stacked):
     _, x0, single = stacked
     loops = closed_loops(MASSES, PAPER, x0, horizon=10, steps=12)
@@ -113,6 +231,11 @@ def still(x):
     return np.zeros(2)
 
 
+TWO = runs([1, 2])
+SHIFTED = runs([1, 2], start=1)
+APART = jax.tree.map(lambda *leaves: np.stack(leaves), TWO, SHIFTED)
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
@@ -121,6 +244,37 @@ def still(x):
         (lambda: accuracy(PAPER, POOL), "comparisons must be a Comparisons, got Trajectory"),
         (lambda: accuracy(1.0, ASKED), "model must be a function"),
         (lambda: accuracy(PAPER, ASKED), r"trajectory.x must have shape \(..., any, 6\)"),
+        (lambda: regret("σ", APART), "cost must be a function"),
+        (lambda: regret(effort, [[1, 2]]), "trajectories must be a Trajectory, got list"),
+        (lambda: regret(effort, TWO), r"\(controllers, states\) .*got \(2,\); or pass best"),
+        (lambda: regret(effort, TWO[0]), r"trajectories must have shape \(controllers, states\)"),
+        (lambda: regret(effort, APART), "trajectories must start in the same states"),
+        (lambda: regret(effort, TWO, [1, 2]), "best must be a Trajectory, got list"),
+        (lambda: regret(effort, TWO, SHIFTED), "best must start in the same states"),
+        (lambda: regret(effort, TWO, runs([1, 2, 3])), "best must start in the same states"),
+        (lambda: regret(effort, APART, TWO), "best must start in the same states"),
+        (lambda: win_rate("Π", TWO, TWO), "preference must be a function"),
+        (lambda: win_rate(lambda a, b: 1.0, TWO, TWO), r"must return 2 answers in \[0, 1\], got"),
+        (lambda: win_rate(lambda a, b: [7, 7], TWO, TWO), r"must return 2 answers in \[0, 1\]"),
+        (lambda: win_rate(prefers_less, [1, 2], TWO), "first must be a Trajectory, got list"),
+        (lambda: win_rate(prefers_less, TWO, None), "second must be a Trajectory, got NoneType"),
+        (
+            lambda: win_rate(prefers_less, APART, APART),
+            r"first must have shape \(m,\), got \(2, 2\)",
+        ),
+        (lambda: win_rate(prefers_less, TWO, TWO[0]), r"second must have shape \(m,\), got \(\)"),
+        (lambda: win_rate(prefers_less, TWO, SHIFTED), "second must start in the same states"),
+        (lambda: win_rate(prefers_less, TWO, TWO[:1]), "second must start in the same states"),
+        (
+            lambda: win_rate(prefers_less, TWO, TWO, confidence=1),
+            r"confidence must lie in \(0, 1\)",
+        ),
+        (
+            lambda: win_rate(prefers_less, TWO, TWO, confidence=0),
+            r"confidence must lie in \(0, 1\)",
+        ),
+        (lambda: win_rate(prefers_less, TWO, TWO, confidence=-1), "confidence must be finite and"),
+        (lambda: win_rate(prefers_less, TWO, TWO, confidence="1"), "confidence must be a number"),
         (lambda: simulate("plant", still, RADIUS, 2), "system must be a LinearSystem, got str"),
         (lambda: simulate(MASSES, still, RADIUS[:5], 2), r"x0 must have shape \(..., 6\)"),
         (lambda: simulate(MASSES, still, RADIUS * np.nan, 2), "x0 must be finite"),

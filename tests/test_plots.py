@@ -28,6 +28,16 @@ def test_the_style_is_safe_for_the_colour_blind_and_in_grey():
     assert len(looks) == len(cycle)
 
 
+def test_a_table_holds_the_texts_and_marks_what_lies_inside():
+    html = plots.table(["a", "b"], [["x", plots.mark(2.04, 1.0, 2.0, 1)]], "what").data
+    assert html == (
+        "<table><caption>what</caption><thead><tr><th>a</th><th>b</th></tr></thead><tbody>"
+        '<tr><td>x</td><td><span class="inside">2.0</span></td></tr></tbody></table>'
+    )
+    assert plots.mark(2.06, 1.0, 2.0, 1) == '<span class="outside">2.1</span>'
+    assert plots.mark(np.inf, 5, np.inf, text=">30") == '<span class="inside">>30</span>'
+
+
 @pytest.mark.parametrize("step", [False, True])
 def test_responses_are_drawn_over_time(step):
     ax = plots.responses({"a": [1, 2, 3], "b": [0, 0, 1]}, 0.2, ylabel="x in m", step=step)

@@ -1,23 +1,31 @@
-"""Preferences, data sets of comparisons, and files that survive what happens to files."""
+"""Simulated people, and the tools to put them together, against answers worked out by hand."""
 
 from __future__ import annotations
 
-import json
-import os
-
-import jax
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 
-from prefmpc import Comparisons, QuadraticPreference, Trajectory, one_by_one
+from prefmpc import (
+    QuadraticPreference,
+    SettlingTimePreference,
+    Trajectory,
+    by_criterion,
+    erring,
+    lexicographic,
+    logistic,
+    max_input,
+    one_by_one,
+    settling_time,
+)
 
-KEY = jax.random.key(2000)
 RNG = np.random.default_rng(0)
 POOL = Trajectory(*(RNG.normal(size=(6, *s)) for s in [(4, 2), (3, 1), (3, 5)]))
 Q, R = np.diag([2.0, 1.0]), np.eye(1)
 PREFERENCE = QuadraticPreference(Q, R)
+INF, NAN = np.inf, np.nan
 
 
 def stage(x, u):
@@ -41,168 +49,166 @@ def test_one_by_one_asks_the_same_question_of_every_pair():
     np.testing.assert_array_equal(ask(first, second), PREFERENCE(first, second))
 
 
-def test_random_pairs_are_of_two_trajectories_and_answered_by_the_preference():
-    drawn = Comparisons.random(POOL, PREFERENCE, 300, key=KEY)
-    assert len(drawn) == 300
-    assert (drawn.first != drawn.second).all()
-    seen = np.zeros((6, 6), bool)
-    seen[drawn.first, drawn.second] = True
-    assert (seen | np.eye(6, dtype=bool)).all()  # every ordered pair comes up
-    np.testing.assert_array_equal(drawn.labels, PREFERENCE(*drawn.pairs))
-    again = Comparisons.random(POOL, PREFERENCE, 300, key=KEY)
-    np.testing.assert_array_equal(again.first, drawn.first)
-    np.testing.assert_array_equal(again.second, drawn.second)
+def responses(*rows):
+    """A batch of trajectories from outputs y_0 … y_3 and the largest input of each."""
+    y, u = (np.array(column, float) for column in zip(*rows, strict=True))
+    inputs = np.zeros((len(rows), 4, 2))
+    inputs[:, 1, 1] = u
+    return Trajectory(np.zeros((len(rows), 5, 1)), inputs, y[..., None])
 
 
-def test_own_recordings_as_lists():
-    # One step, one state, one input, two comparisons; nothing here knows of JAX.
-    mine = Comparisons.from_arrays(
-        [[[1], [2]], [[3], [4]]], [[[0.1]], [[0.2]]], [[[5], [6]], [[7], [8]]], [[[0]], [[0]]],
-        [1, 0.5],
-    )  # fmt: skip
-    first, second = mine.pairs
-    np.testing.assert_array_equal(first.x[..., 0], [[1, 2], [3, 4]])
-    np.testing.assert_array_equal(second.x[..., 0], [[5, 6], [7, 8]])
-    np.testing.assert_array_equal(first.u.ravel(), [0.1, 0.2])
-    np.testing.assert_array_equal(mine.labels, [1, 0.5])
+AT_1, AT_2, NEVER, TOO_LATE = [1, 0, 0, 0], [-1, 1, 0, 0], [1, 1, 1, 1], [0, 0, 0, 1]
 
 
-def test_own_outputs_are_kept():
-    y = np.arange(2.0).reshape(1, 1, 2)
-    mine = Comparisons.from_arrays(
-        np.ones((1, 2, 1)), np.ones((1, 1, 1)), np.ones((1, 2, 1)), np.ones((1, 1, 1)), [0],
-        y_first=y, y_second=-y,
-    )  # fmt: skip
-    np.testing.assert_array_equal(mine.pairs[0].y, y)
-    np.testing.assert_array_equal(mine.pairs[1].y, -y)
+def test_the_response_that_settles_first_is_preferred_whatever_it_takes():
+    ask = SettlingTimePreference()
+    answers = ask(
+        responses((AT_1, 9), (AT_2, 1), (AT_1, 9), (NEVER, 1), (TOO_LATE, 1)),
+        responses((AT_2, 1), (AT_1, 9), (NEVER, 1), (AT_2, 9), (AT_2, 9)),
+    )
+    np.testing.assert_array_equal(answers, [1, 0, 1, 0, 0])
+    assert answers.dtype == np.float64
 
 
-def test_subset_by_numbers_and_by_mask():
-    all_of_them = Comparisons(POOL, [0, 1, 2], [3, 4, 5], [1, 0, 0.5])
-    chosen = all_of_them.subset([2, 0])
-    np.testing.assert_array_equal(chosen.first, [2, 0])
-    np.testing.assert_array_equal(chosen.second, [5, 3])
-    np.testing.assert_array_equal(chosen.labels, [0.5, 1])
-    masked = all_of_them.subset([True, False, True])
-    np.testing.assert_array_equal(masked.first, [0, 2])
+def test_among_equal_settling_times_the_smaller_input_wins():
+    first = responses((AT_1, 1), (AT_1, -3), (AT_2, 2), (NEVER, 1), (TOO_LATE, 2), (NEVER, 1))
+    second = responses((AT_1, 2), (AT_1, 2), (AT_2, -2), (TOO_LATE, 1), (NEVER, 1), (AT_1, 9))
+    np.testing.assert_array_equal(SettlingTimePreference()(first, second), [1, 0, 1, 1, 0, 0])
+    half = SettlingTimePreference(tie_break=None)
+    np.testing.assert_array_equal(half(first, second), [0.5] * 5 + [0])
+    drop = SettlingTimePreference(tie_break=None, ties="drop")
+    np.testing.assert_array_equal(drop(first, second), [NAN] * 5 + [0])
+    # With Πᵤ nothing is left to drop.
+    both = SettlingTimePreference(ties="drop")
+    np.testing.assert_array_equal(both(first, second), [1, 0, 1, 1, 0, 0])
 
 
-def contents(comparisons):
-    T = comparisons.trajectories
-    return [np.asarray(a) for a in (T.x, T.u, T.y)] + [
-        comparisons.first,
-        comparisons.second,
-        comparisons.labels,
-    ]
+def test_epsilon_says_what_settled_means():
+    slow, quick = responses(([2, 0.4, 0.4, 0.3], 0)), responses(([2, 0.6, 0.1, 0.1], 0))
+    for epsilon, answer in {0.2: 0, 0.3: 0, 0.5: 1, 0.7: 0.5, 3: 0.5}.items():
+        ask = SettlingTimePreference(epsilon, tie_break=None)
+        np.testing.assert_array_equal(ask(slow, quick), [answer])
+        np.testing.assert_array_equal(ask(quick, slow), [1 - answer])
 
 
-def assert_same(one, other):
-    for a, b in zip(contents(one), contents(other), strict=True):
-        assert a.dtype == b.dtype
-        assert a.tobytes() == b.tobytes()
+def test_a_single_pair_has_a_single_answer():
+    first, second = responses((AT_1, 1), (AT_2, 1))[0], responses((AT_2, 1))[0]
+    assert SettlingTimePreference()(first, second) == 1
+    assert by_criterion(settling_time)(first, second).shape == ()
+    assert logistic(max_input, 1.0)(first, second) == 0.5
 
 
-@pytest.fixture
-def some():
-    return Comparisons(POOL, [0, 1, 2], [3, 4, 5], [1, 0, 0.3])
+def having(values):
+    """Trajectories that start in ``values``, for the criterion below; infinite ones too."""
+    values = np.asarray(values, float)
+    x = np.zeros((len(values), 2, 2))
+    x[:, 0, 0], x[:, 0, 1] = np.nan_to_num(values, posinf=0), np.isinf(values)
+    return Trajectory(x, np.zeros((len(values), 1, 1)))
 
 
-@given(st.lists(st.tuples(st.integers(0, 5), st.integers(0, 5), st.floats(0, 1)), min_size=1))
-def test_files_give_back_every_bit(tmp_path_factory, rows):
-    first, second, labels = zip(*rows, strict=True)
-    saved = Comparisons(POOL, first, second, labels)
-    path = tmp_path_factory.mktemp("saved") / "data.npz"
-    assert saved.save(path) == path
-    assert_same(Comparisons.load(path), saved)
+def criterion(T):
+    return np.where(T.x[..., 0, 1] == 1, INF, T.x[..., 0, 0])
 
 
-def test_an_old_file_is_replaced_only_on_demand(tmp_path, some):
-    path = some.save(tmp_path / "data.npz")
-    other = some.subset([1])
-    with pytest.raises(FileExistsError, match="overwrite=True"):
-        other.save(path)
-    assert_same(Comparisons.load(path), some)
-    other.save(str(path), overwrite=True)
-    assert_same(Comparisons.load(str(path)), other)
-    assert [p.name for p in tmp_path.iterdir()] == ["data.npz"]
+def test_the_smaller_criterion_wins_by_more_than_the_tolerance():
+    first, second = having([1, 2, 2, 3, 5, INF, INF]), having([2, 1, 2, 5, 3, INF, 0])
+    exact = by_criterion(criterion)
+    np.testing.assert_array_equal(exact(first, second), [1, 0, 0.5, 1, 0, 0.5, 0])
+    np.testing.assert_array_equal(exact(second, first), [0, 1, 0.5, 0, 1, 0.5, 1])
+    blunt = by_criterion(criterion, tolerance=1)
+    np.testing.assert_array_equal(blunt(first, second), [0.5, 0.5, 0.5, 1, 0, 0.5, 0])
+    np.testing.assert_array_equal(
+        by_criterion(max_input)(responses((AT_1, -3)), responses((AT_1, 2))), [0]
+    )
 
 
-@pytest.mark.parametrize("broken", ["os.replace", "numpy.savez_compressed", "os.fsync"])
-@pytest.mark.parametrize("stop", [OSError("full"), KeyboardInterrupt()], ids=["disk", "ctrl-c"])
-def test_an_interrupted_write_leaves_the_old_file_whole(tmp_path, monkeypatch, some, broken, stop):
-    path = some.save(tmp_path / "data.npz")
-    before = path.read_bytes()
-
-    def fail(*args, **kwargs):
-        raise stop
-
-    monkeypatch.setattr(broken, fail)
-    with pytest.raises(type(stop)):
-        some.subset([1]).save(path, overwrite=True)
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
+def always(*answers):
+    return lambda first, second: np.array(answers)
 
 
-def test_a_saved_file_has_ordinary_permissions(tmp_path, some):
-    path = some.save(tmp_path / "data.npz")
-    plain = tmp_path / "plain"
-    plain.touch()
-    assert path.stat().st_mode == plain.stat().st_mode
+def scripted(*answers):
+    """Answers by the first trajectory's number (its x(0)), and remembers what it was asked."""
+    asked = []
+
+    def preference(first, second):
+        numbers = np.asarray(first.x[:, 0, 0], int)
+        asked.append(list(numbers))
+        return np.asarray(answers, float)[numbers]
+
+    return preference, asked
 
 
-def stored(some, **changes):
-    names = ["x", "u", "y", "first", "second", "labels"]
-    arrays = dict(zip(names, contents(some), strict=True), format_version=np.asarray(1))
-    return {name: value for name, value in {**arrays, **changes}.items() if value is not None}
+def test_one_is_asked_after_another_until_somebody_decides():
+    T = Trajectory(np.arange(6.0)[:, None, None] * np.ones((2, 1)), np.zeros((6, 1, 1)))
+    one, _ = scripted(1, 0, 0.5, NAN, 0.7, 0.5)
+    two, asked_two = scripted(0, 1, 0, 1, 0, NAN)
+    three, asked_three = scripted(NAN, NAN, NAN, NAN, NAN, 0.5)
+    np.testing.assert_array_equal(lexicographic(one)(T, T), [1, 0, 0.5, NAN, 0.7, 0.5])
+    np.testing.assert_array_equal(lexicographic(one, two)(T, T), [1, 0, 0, 1, 0.7, NAN])
+    np.testing.assert_array_equal(lexicographic(one, two, three)(T, T), [1, 0, 0, 1, 0.7, 0.5])
+    # Only about what is still open; a person's time is dear.
+    assert asked_two == [[2, 3, 5], [2, 3, 5]]
+    assert asked_three == [[5]]
+    # Nobody decides: the last answer stands. A single pair works as well.
+    nobody = lexicographic(scripted(0.5, NAN)[0], scripted(NAN, 0.5)[0])
+    np.testing.assert_array_equal(nobody(T[:2], T[:2]), [NAN, 0.5])
+    assert lexicographic(one, two)(T[3], T[3]) == 1
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"format_version": np.asarray(2)}, "format version 1, got 2"),
-        ({"format_version": np.asarray([1, 1])}, "format version 1"),
-        ({"format_version": np.asarray("one")}, "format version 1"),
-        ({"labels": None, "x": None}, r"lacks \['labels', 'x'\]"),
-        ({"format_version": None}, "lacks"),
-        ({"labels": np.array([1, 0, 2.0])}, r"labels must lie in \[0, 1\]"),
-        ({"x": np.full((6, 4, 2), np.nan)}, "x must be finite"),
-        ({"first": np.array([0, 1, 99])}, "first must point into the 6 trajectories"),
-        ({"labels": np.array([{}, 0, 1], object)}, "path must be a readable .npz file"),
-    ],
-)
-def test_a_wrong_file_is_refused_by_name(tmp_path, some, changes, words):
-    path = tmp_path / "data.npz"
-    np.savez(path, allow_pickle=True, **stored(some, **changes))
-    with pytest.raises(ValueError, match=words):
-        Comparisons.load(path)
+def prefers_less_input(first, second):
+    """Πᵤ as the paper's text has it."""
+    return np.where(max_input(first) <= max_input(second), 1.0, 0.0)
 
 
-def test_garbage_is_refused(tmp_path):
-    path = tmp_path / "data.npz"
-    for garbage in (b"", b"garbage", json.dumps({"x": 1}).encode()):
-        path.write_bytes(garbage)
-        with pytest.raises(ValueError, match="path must be a readable"):
-            Comparisons.load(path)
-    np.save(tmp_path / "one.npy", np.ones(3))
-    with pytest.raises(ValueError, match="path must be a readable"):
-        Comparisons.load(tmp_path / "one.npy")
-    with pytest.raises(FileNotFoundError):
-        Comparisons.load(tmp_path / "nothing.npz")
+@given(arrays(float, (2, 8, 4), elements=st.integers(0, 1)), st.integers(0, 100))
+def test_the_paper_s_preference_is_settling_first_then_effort(y, seed):
+    u = np.random.default_rng(seed).integers(-1, 2, (2, 8, 4, 1)).astype(float)
+    first, second = (Trajectory(np.zeros((8, 5, 1)), u[i], y[i, ..., None]) for i in (0, 1))
+    put_together = lexicographic(by_criterion(settling_time), prefers_less_input)
+    expected = SettlingTimePreference()(first, second)
+    assert set(expected) <= {0, 1}
+    np.testing.assert_array_equal(put_together(first, second), expected)
 
 
-class Explosive:
-    def __reduce__(self):
-        return os.abort, ()
+def test_wrong_answers_come_with_their_rate():
+    T = having([0] * 5)
+    person = always(1, 0, 0.5, 0.7, NAN)
+    # 0.9·0.7 + 0.1·0.3 = 0.66
+    np.testing.assert_allclose(erring(person, 0.1)(T, T), [0.9, 0.1, 0.5, 0.66, NAN], rtol=1e-14)
+    np.testing.assert_array_equal(erring(person, 0)(T, T), person(T, T))
+    np.testing.assert_allclose(erring(person, 1)(T, T), [0, 1, 0.5, 0.3, NAN], atol=1e-15)
+    np.testing.assert_array_equal(erring(person, 0.5)(T, T), [0.5] * 4 + [NAN])
 
 
-def test_a_pickle_in_a_file_is_never_run(tmp_path, some):
-    path = tmp_path / "data.npz"
-    np.savez(path, allow_pickle=True, **stored(some, labels=np.array([Explosive()], object)))
-    with pytest.raises(ValueError, match="allow_pickle=False"):
-        Comparisons.load(path)
+def test_choices_by_the_logistic_function():
+    # P = 1 / (1 + exp(gap / 2)) at the gaps 0, 2, −2, 2 ln 3 and −2 ln 3.
+    first, second = having([3, 5, 3, 2 * np.log(3), 0]), having([3, 3, 5, 0, 2 * np.log(3)])
+    expected = [0.5, 1 / (1 + np.e), np.e / (1 + np.e), 0.25, 0.75]
+    np.testing.assert_allclose(logistic(criterion, 2.0)(first, second), expected, rtol=1e-14)
 
 
-X, U = np.ones((2, 4, 2)), np.ones((2, 3, 1))
+def test_an_infinite_criterion_loses_for_certain_and_a_huge_gap_overflows_nowhere():
+    first, second = having([INF, INF, 3, 1e300, 0, 1e4]), having([INF, 3, INF, 0, 1e300, 0])
+    np.testing.assert_array_equal(logistic(criterion, 1.0)(first, second), [0.5, 0, 1, 0, 1, 0])
+
+
+NUMBERS = st.floats(-1e6, 1e6) | st.sampled_from([0.0, 1.0, INF])
+VALUES = st.lists(NUMBERS, min_size=4, max_size=4)
+
+
+@given(VALUES, VALUES, st.floats(1e-3, 1e3))
+def test_both_orders_of_a_pair_give_the_same_person(a, b, scale):
+    first, second = having(a), having(b)
+    unsure = logistic(criterion, scale)
+    p, q = unsure(first, second), unsure(second, first)
+    np.testing.assert_allclose(p + q, 1, atol=1e-15)
+    sure = by_criterion(criterion)(first, second)
+    np.testing.assert_array_equal(sure + by_criterion(criterion)(second, first), 1)
+    assert (np.sign(p - 0.5) * np.sign(sure - 0.5) >= 0).all()
+
+
+def constant(value):
+    return lambda T: np.full(T.batch_shape, value)
 
 
 @pytest.mark.parametrize(
@@ -213,33 +219,29 @@ X, U = np.ones((2, 4, 2)), np.ones((2, 3, 1))
         (lambda: QuadraticPreference(np.eye(3), R)(POOL, POOL), r"Q must have shape \(..., 2, 2\)"),
         (lambda: one_by_one("ask"), "ask must be a function"),
         (lambda: one_by_one(lambda a, b: "left")(POOL, POOL), "ask must return a number"),
-        (lambda: Comparisons(POOL, [], [], []), "at least one comparison, got an empty data set"),
-        (lambda: Comparisons(POOL, [0], [1], [1.1]), r"labels must lie in \[0, 1\].*1.1 at index"),
-        (lambda: Comparisons(POOL, [0], [1], [-1]), r"labels must lie in \[0, 1\]"),
-        (lambda: Comparisons(POOL, [0], [1], [np.nan]), "labels must be finite"),
-        (lambda: Comparisons(POOL, [0], [1], [[1]]), "labels must have 1 dimension"),
-        (lambda: Comparisons(POOL, [0, 1], [1], [1]), "first must hold 1 whole numbers"),
-        (lambda: Comparisons(POOL, [0], [1.5], [1]), "second must hold 1 whole numbers"),
-        (lambda: Comparisons(POOL, [0], [6], [1]), r"second must point.*0 to 5\), got 6 to 6"),
-        (lambda: Comparisons(POOL, [-1], [1], [1]), "first must point into the 6"),
-        (lambda: Comparisons(POOL.x, [0], [1], [1]), "trajectories must be a Trajectory"),
-        (lambda: Comparisons(POOL[0], [0], [1], [1]), "trajectories must have one leading dim"),
-        (lambda: Comparisons.random(POOL, PREFERENCE, 0, key=KEY), "size must be a whole number"),
-        (lambda: Comparisons.random(POOL[:1], PREFERENCE, 2, key=KEY), "at least two to compare"),
-        (lambda: Comparisons.random(POOL.x, PREFERENCE, 2, key=KEY), "trajectories must be a Traj"),
-        (lambda: Comparisons.random(POOL[0], PREFERENCE, 2, key=KEY), "trajectories must have one"),
-        (lambda: Comparisons.random(POOL, lambda a, b: 1, 2, key=KEY), "one label for each of the"),
-        (
-            lambda: Comparisons.random(POOL, lambda a, b: np.full(2, np.nan), 2, key=KEY),
-            "labels must be finite",
-        ),
-        (lambda: Comparisons.from_arrays(X, U, X[:1], U[:1], [1, 1]), "must have equal shapes"),
-        (lambda: Comparisons.from_arrays(X[0], U[0], X[0], U[0], [1]), "one leading dimension"),
-        (lambda: Comparisons.from_arrays(X, U, X, U, [1]), "first must hold 1 whole"),
-        (lambda: Comparisons.from_arrays(X * np.nan, U, X, U, [1, 1]), "x must be finite"),
-        (lambda: Comparisons(POOL, [0], [1], [1]).subset([]), "empty"),
-        (lambda: Comparisons(POOL, [0], [1], [1]).subset([5]), "index must"),
-        (lambda: Comparisons(POOL, [0], [1], [1]).save("data.csv"), "path must end in .npz"),
+        (lambda: SettlingTimePreference(-0.1), "epsilon must be finite and at least 0, got -0.1"),
+        (lambda: SettlingTimePreference(NAN), "epsilon must be finite"),
+        (lambda: SettlingTimePreference("0.1"), "epsilon must be a number of at least 0"),
+        (lambda: SettlingTimePreference(tie_break="u"), 'tie_break must be "max_input" or None'),
+        (lambda: SettlingTimePreference(ties="skip"), 'ties must be "half" or "drop", got .skip'),
+        (lambda: SettlingTimePreference()(POOL.y, POOL.y), "trajectory must be a Trajectory"),
+        (lambda: by_criterion(1.0), "criterion must be a function, got 1.0"),
+        (lambda: by_criterion(max_input, -1), "tolerance must be finite and at least 0"),
+        (lambda: by_criterion(max_input, INF), "tolerance must be finite"),
+        (lambda: by_criterion(lambda T: 1)(POOL, POOL), r"one number a trajectory \(6,\), got"),
+        (lambda: by_criterion(lambda T: T.u)(POOL, POOL), r"got shape \(6, 3, 1\)"),
+        (lambda: by_criterion(constant(NAN))(POOL, POOL), r"got shape \(6,\) with NaN"),
+        (lambda: lexicographic(), "at least one preference, got none"),
+        (lambda: lexicographic(PREFERENCE, "Πᵤ"), r"preferences\[1\] must be a function"),
+        (lambda: erring("Π", 0.1), "preference must be a function"),
+        (lambda: erring(PREFERENCE, 1.1), r"rate must lie in \[0, 1\], got 1.1"),
+        (lambda: erring(PREFERENCE, -0.1), "rate must be finite and at least 0"),
+        (lambda: erring(PREFERENCE, NAN), "rate must be finite"),
+        (lambda: logistic(None, 1.0), "criterion must be a function"),
+        (lambda: logistic(max_input, 0), "scale must be positive, got 0"),
+        (lambda: logistic(max_input, -1), "scale must be finite and at least 0"),
+        (lambda: logistic(max_input, INF), "scale must be finite"),
+        (lambda: logistic(constant(NAN), 1)(POOL, POOL), "one number a trajectory.*with NaN"),
     ],
 )
 def test_bad_input_is_named(call, words):

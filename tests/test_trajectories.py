@@ -1,4 +1,4 @@
-"""Trajectories, φ and the random pools against arithmetic done by hand."""
+"""Trajectories, φ, settling times and rollouts against arithmetic done by hand."""
 
 from __future__ import annotations
 
@@ -16,16 +16,14 @@ from prefmpc import (
     LinearSystem,
     QuadraticCost,
     Trajectory,
-    lqr_pool,
-    oscillating_masses,
+    max_input,
     phi,
-    random_states,
-    random_weights,
     rollout,
     second_moments,
+    settling_text,
+    settling_time,
 )
-
-KEY = jax.random.key(2000)
+from prefmpc._pytree import bypass_init
 
 # Two steps, two states, one input.
 X = np.array([[1.0, 2.0], [3.0, -1.0], [100.0, 100.0]])
@@ -122,73 +120,91 @@ def test_rollout_of_a_batch_with_a_gain_each():
     np.testing.assert_array_equal(T.x[1], [[2, 0]] * 3)
 
 
-def test_a_pool_is_made_of_lqr_loops_from_random_states(masses):
-    radius = np.array([0.3, 0.3, 0.3, 0.05, 0.05, 0.05])
-    pool = lqr_pool(masses, 8, 10, key=KEY, radius=radius)
-    assert pool.x.shape == (8, 11, 6)
-    x, u = np.asarray(pool.x), np.asarray(pool.u)
-    moved = x[:, :-1] @ masses.A.T + u @ masses.B.T
-    np.testing.assert_allclose(x[:, 1:], moved, atol=1e-13)
-    assert (np.abs(x[:, 0]) <= radius).all()
-    # Each loop has one gain: inputs are linear in the states, and gains differ between loops.
-    gains = [np.linalg.lstsq(x[i, :-1], u[i], rcond=None) for i in range(8)]
-    for i, (K, *_) in enumerate(gains):
-        np.testing.assert_allclose(x[i, :-1] @ K, u[i], atol=1e-10)
-    assert np.abs(gains[0][0] - gains[1][0]).max() > 1e-3
-    again = lqr_pool(masses, 8, 10, key=KEY, radius=radius)
-    np.testing.assert_array_equal(again.x, pool.x)
+def settles(*y, epsilon=0.1):
+    """κ of a single output."""
+    return settling_time(np.array(y, float)[:, None], epsilon)
 
 
-def test_a_pool_uses_the_weights_that_it_is_given(masses):
-    Q, R = np.diag([40.0, 40, 40, 5, 5, 5]), 0.2 * np.eye(2)
-    weights = np.stack([Q] * 3), np.stack([R] * 3)
-    pool = lqr_pool(masses, 3, 5, key=KEY, radius=np.ones(6), weights=weights)
-    K = masses.lqr(Q, R)[0]
-    np.testing.assert_allclose(pool.u, -pool.x[:, :-1] @ K.T, atol=1e-12)
+def test_settling_times_by_hand():
+    assert settles(0, 0, 0) == 0
+    assert settles(1, 0, 0) == 1  # outside at first only
+    assert settles(0, 1, 0) == 2
+    assert settles(1, -1, 0) == 2
+    assert settles(1, 0, 1, 0, 0) == 3  # it comes back, and leaves once more
+    assert settles(1, 0, 1, 0, 1) == np.inf
+    assert settles(0, 0, 1) == np.inf  # outside at last only
+    assert settles(1, 1, 1) == np.inf
+    assert settles(0) == 0
+    assert settles(1) == np.inf
+    assert settles(1, 0.1, -0.1, epsilon=0.1) == 1  # the border belongs to the ball
+    assert settles(1, 0.1, np.nextafter(0.1, 1), epsilon=0.1) == np.inf
+    assert settles(1, 0, 0, epsilon=0) == 1
 
 
-def test_random_weights_are_predominantly_diagonal():
-    Q, R = random_weights(6, 2, key=KEY, shape=(200,))
-    assert (Q.shape, R.shape) == ((200, 6, 6), (200, 2, 2))
-    for weights in (Q, R):
-        np.testing.assert_allclose(weights, np.swapaxes(weights, -1, -2), atol=1e-14)
-        assert np.linalg.eigvalsh(weights).min() >= 0.1
-        diagonal = np.diagonal(weights, axis1=-2, axis2=-1)
-        assert diagonal.min() >= 0.1
-        assert 4.5 < diagonal.mean() < 5.7  # U[0.1, 10] has mean 5.05, coupling adds 0.03
-    off = Q - np.eye(6) * Q
-    assert 0 < np.abs(off).max() < 0.2
-    narrow, _ = random_weights(2, 1, key=KEY, low=1, high=2, coupling=0)
-    np.testing.assert_array_equal(narrow, np.diag(np.diag(narrow)))
-    assert ((np.diag(narrow) >= 1) & (np.diag(narrow) <= 2)).all()
+def test_settling_is_about_the_length_of_the_output():
+    # ‖(3, 4)‖₂ = 5, though no entry exceeds 4; and y counts, not x.
+    y = np.array([[6.0, 0], [3, 4], [0, 0]])
+    T = Trajectory(np.ones((4, 1)), np.ones((3, 1)), y)
+    assert settling_time(T, 5) == settling_time(y, 5) == 1
+    assert settling_time(T, 4.9) == 2
+    assert settling_time(T, 6) == 0
+    assert settling_time(T) == 2  # ε = 0.1
+    assert settling_time(Trajectory(np.ones((4, 1)), np.ones((3, 1)))) == np.inf
 
 
-def test_random_states_fill_their_box():
-    x = random_states([1.0, 0.0, 3.0], key=KEY, shape=(4000,))
-    np.testing.assert_array_equal(x[:, 1], 0)
-    assert (np.abs(x) <= [1, 0, 3]).all()
-    # Uniform on [−r, r]: mean 0, standard deviation r/√3.
-    np.testing.assert_allclose(x.mean(0) / [1, 1, 3], 0, atol=0.04)
-    np.testing.assert_allclose(x.std(0), np.array([1, 0, 3]) / np.sqrt(3), rtol=0.03, atol=1e-12)
-    np.testing.assert_array_equal(x, random_states([1.0, 0.0, 3.0], key=KEY, shape=(4000,)))
+def test_what_is_not_finite_has_not_settled():
+    y = np.zeros((4, 3, 1))
+    y[0, 0], y[1, 1], y[2, 2] = np.nan, np.inf, np.nan
+    T = bypass_init(Trajectory, x=np.zeros((4, 4, 1)), u=np.zeros((4, 3, 1)), y=y)
+    np.testing.assert_array_equal(settling_time(T), [1, 2, np.inf, 0])
+    with pytest.raises(ValueError, match="outputs must be finite"):
+        settling_time(y)
 
 
-def test_every_kind_of_key():
-    one, two = jax.random.split(KEY)
+# 0.3² + 0.4² = 0.5², so that the border comes up.
+OUTPUTS = arrays(
+    float,
+    st.tuples(st.just(2), st.just(3), st.integers(1, 6), st.integers(1, 2)),
+    elements=st.sampled_from([0.0, 0.3, -0.4, 0.5, 0.6, -2.0]),
+)
 
-    def draw(key):
-        return random_states(np.ones(3), key=key)
 
-    np.testing.assert_array_equal(draw(one), draw(jax.random.clone(one)))
-    np.testing.assert_array_equal(draw(one), draw(jax.random.key_data(one)))  # an old-style key
-    assert (draw(one) != draw(two)).all()
-    generator = np.random.default_rng(0)
-    assert (draw(generator) != draw(generator)).all()  # NumPy's own moves on
+@given(OUTPUTS)
+def test_settling_times_as_they_are_defined(y):
+    def slow(outputs):
+        """The least κ with ‖y_k‖ ≤ ε for all k ≥ κ."""
+        inside = [np.sqrt(sum(v * v for v in output)) <= 0.5 for output in outputs]
+        return next((float(k) for k in range(len(inside)) if all(inside[k:])), np.inf)
+
+    expected = [[slow(outputs) for outputs in row] for row in y]
+    kappa = settling_time(y, 0.5)
+    assert kappa.dtype == np.float64
+    np.testing.assert_array_equal(kappa, expected)
+    steps = y.shape[-2]
+    T = Trajectory(np.zeros((2, 3, steps + 1, 1)), np.zeros((2, 3, steps, 1)), y)
+    np.testing.assert_array_equal(settling_time(T, 0.5), expected)
+    np.testing.assert_array_equal(settling_time(y.tolist(), 0.5), expected)
+
+
+def test_settling_times_in_words():
+    assert settling_text(7, 30) == settling_text(np.float64(7), 30) == "7"
+    assert settling_text(6.5, 30) == "6.5"
+    assert settling_text(0.0, 30) == "0"
+    assert settling_text(np.inf, 30) == ">30"
+    assert settling_text(settles(1, 1), 2) == ">2"
+
+
+def test_the_largest_input_by_hand():
+    u = np.array([[[1, -2], [0, 1.5]], [[0, 0], [0.5, 0]], [[-1, 0], [-3, 2]]])
+    T = Trajectory(np.zeros((3, 3, 1)), u)
+    np.testing.assert_array_equal(max_input(T), [2, 0.5, 3])
+    assert max_input(T[0]) == 2
+    pairs = Trajectory(np.zeros((1, 3, 3, 1)), u[None])
+    np.testing.assert_array_equal(max_input(pairs), [[2, 0.5, 3]])
 
 
 NAN_X = X.copy()
 NAN_X[1, 0] = np.nan
-MASSES = oscillating_masses()
 
 
 @pytest.mark.parametrize(
@@ -220,30 +236,18 @@ MASSES = oscillating_masses()
         (lambda: rollout(PLANT, [1, 2], lambda x: x, 2), r"law must return .*\(1,\)"),
         (lambda: rollout(PLANT, np.ones((3, 2)), np.ones((2, 1, 2)), 2), "law must"),
         (lambda: rollout("plant", [1, 2], [[1, 1]], 2), "system must be a LinearSystem"),
-        (lambda: random_weights(0, 1, key=KEY), "nx must be a whole number"),
-        (lambda: random_weights(1, 1.5, key=KEY), "nu must be a whole number"),
-        (lambda: random_weights(1, 1, key=KEY, low=0), "low and high must satisfy 0 < low < high"),
-        (lambda: random_weights(1, 1, key=KEY, low=3, high=2), "0 < low < high, got 3 and 2"),
-        (lambda: random_weights(1, 1, key=KEY, coupling=-1), "coupling must be finite and at"),
-        (lambda: random_states([-1.0], key=KEY), "radius must not be negative"),
-        (lambda: random_states([np.nan], key=KEY), "radius must be finite"),
-        (lambda: random_states([1.0], key=0), "key must be a single JAX random key.*got int"),
-        (lambda: random_states(1.0, key=KEY), "radius must have 1 dimension"),
-        (lambda: lqr_pool(MASSES, 0, 5, key=KEY, radius=np.ones(6)), "size must be a whole"),
-        (lambda: lqr_pool(MASSES, 2, 0, key=KEY, radius=np.ones(6)), "steps must be a whole"),
-        (lambda: lqr_pool(MASSES, 2, 5, key=KEY, radius=np.ones(5)), "x0 must have shape|radius"),
-        (
-            lambda: lqr_pool(
-                MASSES,
-                2,
-                5,
-                key=KEY,
-                radius=np.ones(6),
-                weights=(np.ones((1, 6, 6)), np.ones((1, 2, 2))),
-            ),
-            "weights must hold 2 matrices each, got 1 and 1",
-        ),
-        (lambda: lqr_pool("plant", 2, 5, key=KEY, radius=[1]), "system must be a LinearSystem"),
+        (lambda: max_input(U), "trajectory must be a Trajectory, got ndarray"),
+        (lambda: settling_time(X, -1), "epsilon must be finite and at least 0"),
+        (lambda: settling_time(X, np.nan), "epsilon must be finite"),
+        (lambda: settling_time(X, "0.1"), "epsilon must be a number"),
+        (lambda: settling_time([1.0, 0.0]), r"outputs must have shape \(..., any, any\)"),
+        (lambda: settling_time(NAN_X), "outputs must be finite"),
+        (lambda: settling_time("soon"), "outputs must be an array of real numbers"),
+        (lambda: settling_text("soon", 30), "kappa must be an array of real numbers"),
+        (lambda: settling_text([1, 2], 30), r"kappa must be one settling time, got \[1, 2\]"),
+        (lambda: settling_text(np.nan, 30), "kappa must not contain NaN"),
+        (lambda: settling_text(3, 0), "steps must be a whole number of at least 1"),
+        (lambda: settling_time(np.zeros((2, 0, 3))), "outputs must hold at least one step"),
     ],
 )
 def test_bad_input_is_named(call, words):
