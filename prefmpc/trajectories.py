@@ -169,7 +169,8 @@ def settling_text(kappa: ArrayLike, steps: int) -> str:
     """Return a settling time in steps as text: "7", "6.5", or ">30" if it never settled."""
     if np.ndim(kappa) or np.isnan(value := float(finite_array("kappa", kappa, allow_inf=True))):
         raise ValueError(f"kappa must be one settling time, got {kappa!r}")
-    return f">{positive_int('steps', steps)}" if np.isinf(value) else f"{value:g}"
+    steps = positive_int("steps", steps)
+    return f">{steps}" if np.isinf(value) else f"{value:g}"
 
 
 def rollout(

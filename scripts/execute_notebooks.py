@@ -37,6 +37,7 @@ def set_environment() -> None:
     path = os.environ.get("PYTHONPATH")
     os.environ["PYTHONPATH"] = f"{ROOT}{os.pathsep}{path}" if path else str(ROOT)
     os.environ.setdefault("JAX_PLATFORMS", "cpu")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ["SOURCE_DATE_EPOCH"] = "0"
 
 
