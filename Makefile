@@ -86,7 +86,7 @@ types: $(STAMP)
 	@$(BIN)/mypy --no-error-summary
 
 unit: $(STAMP)
-	@$(BIN)/python -m pytest -q -n 2
+	@$(BIN)/python -m pytest -q -n 2 --dist loadfile
 
 nbval: $(STAMP)
 	@$(BIN)/python -m pytest -q -n 2 --dist loadfile --nbval book/

@@ -114,19 +114,26 @@ def baselines(*, key: Any) -> np.ndarray:
     return 100 * np.array(table).T
 
 
-def measures_case(*, key: Any, loops: int = 200) -> dict[str, np.ndarray]:
+def measures_case(
+    *, key: Any, sizes: tuple[int, ...] = SIZES, loops: int = 200
+) -> dict[str, np.ndarray]:
     """Learn in many ways from one draw of case study 1, and measure each model in four ways.
+
+    Parameters
+    ----------
+    sizes : the first few of `SIZES`; what comes of them does not depend on the others.
 
     Returns
     -------
     dict
-        "baselines" (2, 4), see `baselines`; "leak" (3, 4): accuracies in percent, rows `SIZES`,
+        "baselines" (2, 4), see `baselines`; "leak" (3, 4): accuracies in percent, rows ``sizes``,
         columns `LEAK_COLUMNS`, of the restart with the best accuracy on the test set and of the
-        first one; "models" (n_models, 4): rows `MODELS`, columns `MODEL_COLUMNS`.
+        first one; "models" (n_models, 4): those rows of `MODELS` that were learned, columns
+        `MODEL_COLUMNS`.
     """
     streams = generator(key).spawn(6)
     seed = int(streams[0].integers(2**32))
-    system, pool, train, test = quadratic_data(key=np.random.default_rng(seed), sizes=SIZES)
+    system, pool, train, test = quadratic_data(key=np.random.default_rng(seed), sizes=sizes)
     fresh_pool = lqr_pool(system, 100, QUADRATIC_HORIZON, key=streams[1], radius=RADIUS)
     fresh = Comparisons.random(fresh_pool, the_person(), 2000, key=streams[1])
     same = same_start_data(
@@ -139,7 +146,7 @@ def measures_case(*, key: Any, loops: int = 200) -> dict[str, np.ndarray]:
 
     leak = []
     alike_pool = {"starts": 10, "copies": 5}
-    for n in SIZES:
+    for n in sizes:
         start = rng.integers(2**32)
 
         def train_on(data: Comparisons, start: int = int(start), **options: Any) -> Any:
@@ -166,19 +173,19 @@ def measures_case(*, key: Any, loops: int = 200) -> dict[str, np.ndarray]:
             models[name] = train_on(answers).model
 
     x0 = random_states(RADIUS, key=streams[4], shape=(loops,))
-    ordered = [models[name] for name in MODELS]
+    ordered = [models[name] for name in MODELS if name in models]
     stack = jax.tree.map(lambda *leaves: np.stack(leaves), *ordered)
     runs = closed_loops(system, stack, x0, horizon=QUADRATIC_HORIZON, steps=30)
     best = BatchedMPC(system, models["From Π"], 30).solve(x0)
     if not (runs.solved.all() and best.success):
         raise RuntimeError("an MPC problem was not solved")
-    table = np.empty((len(MODELS), len(MODEL_COLUMNS)))
+    table = np.empty((len(ordered), len(MODEL_COLUMNS)))
     table[:, 0] = 100 * (1 - error_rates(stack, test))
     table[:, 1] = 100 * (1 - error_rates(stack, same))
     lost = regret(models["From Π"], runs.trajectories, best.trajectory)
     table[:, 2] = 100 * lost.mean(axis=1) / np.asarray(best.cost).mean()
     rival = runs.trajectories[1 + np.arange(loops) % RANDOM, np.arange(loops)]
     table[:, 3] = [
-        100 * win_rate(the_person(), runs.trajectories[i], rival).rate for i in range(len(MODELS))
+        100 * win_rate(the_person(), runs.trajectories[i], rival).rate for i in range(len(ordered))
     ]
     return {"baselines": baselines(key=streams[5]), "leak": np.array(leak), "models": table}
