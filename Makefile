@@ -26,7 +26,7 @@ export JAX_PLATFORMS ?= cpu
 export OPENBLAS_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help book test lab notebooks bench clean lint types unit nbval html html-strict test-html
+.PHONY: help book test lab notebooks bench clean lint types unit nbval unit-and-nbval html html-strict test-html
 
 help:
 	@sed -n 's/^# \{0,1\}//p' Makefile | sed -n '1,9p'
@@ -75,7 +75,7 @@ bench: $(STAMP)
 # In this order: the quick ones first.
 test: $(STAMP)
 	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint types html-strict
-	@$(MAKE) --no-print-directory test-html unit nbval
+	@$(MAKE) --no-print-directory test-html unit-and-nbval
 	@echo "All checks passed: lint, types, unit tests, notebooks, HTML."
 
 lint: $(STAMP)
@@ -87,6 +87,10 @@ types: $(STAMP)
 
 unit: $(STAMP)
 	@$(BIN)/python -m pytest -q -n 2 --dist loadfile
+
+# Both in one run, so that no worker waits for the other at the end of the first.
+unit-and-nbval: $(STAMP)
+	@$(BIN)/python -m pytest -q -n 2 --dist loadfile --nbval book/ tests/
 
 nbval: $(STAMP)
 	@$(BIN)/python -m pytest -q -n 2 --dist loadfile --nbval book/
