@@ -6,6 +6,7 @@ objective of the controller.
 """
 
 from prefmpc.comparisons import Comparisons
+from prefmpc.convex import MapResult, WishartPrior, bryson, fit_map
 from prefmpc.evaluation import (
     ClosedLoops,
     WinRate,
@@ -57,6 +58,7 @@ __all__ = [
     "LinearSystem",
     "MPCError",
     "MPCSolution",
+    "MapResult",
     "Moments",
     "Polyhedron",
     "Preference",
@@ -65,11 +67,14 @@ __all__ = [
     "SettlingTimePreference",
     "Trajectory",
     "WinRate",
+    "WishartPrior",
     "accuracy",
+    "bryson",
     "by_criterion",
     "closed_loops",
     "erring",
     "fit",
+    "fit_map",
     "lexicographic",
     "logistic",
     "lqr_pool",
