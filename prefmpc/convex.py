@@ -168,7 +168,7 @@ def fit_map(
     structure : {"full", "diagonal"}
         Which entries of Q and R may differ from zero. "diagonal" needs a diagonal prior.
     tol : float
-        Stop when half the squared Newton decrement is below tol·(1 + |objective|).
+        Stop when half the squared Newton decrement is below ``tol`` times 1 + abs(objective).
 
     Returns
     -------
