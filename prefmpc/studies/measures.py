@@ -15,7 +15,6 @@ from prefmpc.mpc import BatchedMPC
 from prefmpc.pools import lqr_pool, random_states
 from prefmpc.preferences import (
     Preference,
-    QuadraticPreference,
     SettlingTimePreference,
     erring,
     logistic,
@@ -27,20 +26,16 @@ from prefmpc.studies.quadratic import (
     RADIUS,
     error_rates,
     quadratic_data,
+    the_person,
 )
 from prefmpc.studies.settling import SETTLING_HORIZON, diagonal_weights
 from prefmpc.systems import LinearSystem, oscillating_masses
-from prefmpc.training import fit
+from prefmpc.training import best_restart, fit
 from prefmpc.trajectories import Trajectory, phi
 
 SIZES = (20, 100, 400)
 RATES = (0.05, 0.1, 0.2)
 RANDOM = 10
-
-
-def the_person() -> QuadraticPreference:
-    """Return Π of case study 1."""
-    return QuadraticPreference(QUADRATIC_Q, QUADRATIC_R)
 
 
 BASELINES = ("random weights", "smaller ‖p(0)‖²")
@@ -154,7 +149,7 @@ def measures_case(
             return fit(data, key=np.random.default_rng(start), **options)
 
         result = train_on(train[n], selection="leaky_test_accuracy", test=test)
-        by_loss = int(np.argmin(np.where(result.status == "converged", result.training_loss, 9e9)))
+        by_loss = best_restart(result.training_loss, result.status, result.training_loss)
         leak.append(
             [100 * accuracy(model, data) for model in (result.model, result.models[0])
              for data in (test, fresh)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -10,7 +11,7 @@ import numpy as np
 
 from prefmpc._random import generator
 from prefmpc.comparisons import Comparisons
-from prefmpc.evaluation import accuracy, closed_loops
+from prefmpc.evaluation import ClosedLoops, accuracy, closed_loops
 from prefmpc.models import QuadraticCost
 from prefmpc.pools import lqr_pool, random_states
 from prefmpc.preferences import QuadraticPreference
@@ -80,7 +81,7 @@ def quadratic_data(
     """
     streams = generator(key).spawn(3 + len(sizes))
     system = oscillating_masses()
-    preference = QuadraticPreference(QUADRATIC_Q, QUADRATIC_R)
+    preference = the_person()
 
     def make_pool(pool_key: Any) -> Trajectory:
         return lqr_pool(system, 50, QUADRATIC_HORIZON, key=pool_key, radius=RADIUS)
@@ -97,13 +98,30 @@ def quadratic_data(
 
 def error_rates(models: QuadraticCost, comparisons: Comparisons) -> np.ndarray:
     """Return 1 − accuracy on ``comparisons`` for every model of a stack (c,)."""
-    pool = comparisons.trajectories
-    costs = np.stack([models[i](pool) for i in range(models.batch_shape[0])])
+    return np.array([1 - accuracy(models[i], comparisons) for i in range(models.batch_shape[0])])
 
-    def error_rate(row: np.ndarray) -> float:
-        return 1 - accuracy(lambda _: row, comparisons)
 
-    return np.array([error_rate(row) for row in costs])
+def the_person() -> QuadraticPreference:
+    """Return Π of case study 1."""
+    return QuadraticPreference(QUADRATIC_Q, QUADRATIC_R)
+
+
+def stacked_loops(
+    system: LinearSystem, models: Sequence[QuadraticCost], x0: Any, *, horizon: int, steps: int
+) -> Trajectory:
+    """Return the closed loops (c, m) of c models from the states x0 (m, nx).
+
+    Raises a RuntimeError if an MPC problem on the way is not solved.
+    """
+    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *models)
+    return solved(closed_loops(system, stack, x0, horizon=horizon, steps=steps))
+
+
+def solved(runs: ClosedLoops) -> Trajectory:
+    """Return the trajectories, or raise a RuntimeError if an MPC problem was not solved."""
+    if not runs.solved.all():
+        raise RuntimeError("a closed loop met an MPC problem that was not solved")
+    return runs.trajectories
 
 
 def quadratic_case(
@@ -127,18 +145,15 @@ def quadratic_case(
     }
     true = QuadraticCost(QUADRATIC_Q, QUADRATIC_R)
     learned = [true, *(fits[n].model for n in SIZES)]
-    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *learned)
     x0 = random_states(RADIUS, key=key_states, shape=(loops,))
-    many = closed_loops(system, stack, x0, horizon=QUADRATIC_HORIZON, steps=steps)
+    many = stacked_loops(system, learned, x0, horizon=QUADRATIC_HORIZON, steps=steps)
     # Every simulation of the row "Random" has a controller of its own.
     random = QuadraticCost.random(system.nx, system.nu, key=key_random, shape=(loops,))
     each = closed_loops(system, random, x0[:, None], horizon=QUADRATIC_HORIZON, steps=steps)
-    if not (many.solved.all() and each.solved.all()):
-        raise RuntimeError("a closed loop met an MPC problem that was not solved")
 
     names = ["From Π", *ROWS[2:]]
-    runs = {name: many.trajectories[i] for i, name in enumerate(names)}
-    runs["Random"] = each.trajectories[:, 0]
+    runs = {name: many[i] for i, name in enumerate(names)}
+    runs["Random"] = solved(each)[:, 0]
     raw = {name: np.asarray(phi(runs[name], QUADRATIC_Q, QUADRATIC_R)) for name in ROWS}
     performance = {name: values / raw["From Π"].mean() for name, values in raw.items()}
 
@@ -196,12 +211,9 @@ def quadratic_variants(*, key: Any, restarts: int = 20, loops: int = 200) -> dic
     tables[:, :, COLUMNS.index("time s")] = np.nan
     x0 = random_states(RADIUS, key=key_states, shape=(loops,))
     everyone = [model for name in VARIANTS for model in chosen[name]]
-    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *everyone)
-    runs = closed_loops(case.system, stack, x0, horizon=QUADRATIC_HORIZON, steps=30)
-    if not runs.solved.all():
-        raise RuntimeError("a closed loop met an MPC problem that was not solved")
+    runs = stacked_loops(case.system, everyone, x0, horizon=QUADRATIC_HORIZON, steps=30)
     best = np.asarray(phi(case.loops["From Π"], QUADRATIC_Q, QUADRATIC_R)).mean()
-    values = np.asarray(phi(runs.trajectories, QUADRATIC_Q, QUADRATIC_R)) / best
+    values = np.asarray(phi(runs, QUADRATIC_Q, QUADRATIC_R)) / best
     values = values.reshape(len(VARIANTS), len(SIZES), loops)
     tables[:, 2:, 3:] = np.stack([values.mean(-1), values.max(-1), values.min(-1)], axis=-1)
     for v, name in enumerate(VARIANTS):
@@ -228,7 +240,7 @@ def distinct_case(*, key: Any, size: int = 1000, loops: int = 200) -> np.ndarray
     seed = int(key_data.integers(2**32))
     system, pool, train, test = quadratic_data(key=np.random.default_rng(seed), sizes=(size,))
     *_, inner = quadratic_data(key=np.random.default_rng(seed), sizes=(size,), shared_pool=True)
-    preference = QuadraticPreference(QUADRATIC_Q, QUADRATIC_R)
+    preference = the_person()
     pairs = np.stack(np.triu_indices(len(pool), 1), axis=1)
     chosen = key_pairs.permuted(key_pairs.choice(pairs, size, replace=False), axis=1)
     labels = preference(pool[chosen[:, 0]], pool[chosen[:, 1]])
@@ -239,11 +251,9 @@ def distinct_case(*, key: Any, size: int = 1000, loops: int = 200) -> np.ndarray
         for data in (train[size], distinct)
     ]
     known = QuadraticCost(QUADRATIC_Q, QUADRATIC_R)
-    stack = jax.tree.map(lambda *leaves: np.stack(leaves), known, *(r.model for r in models))
     x0 = random_states(RADIUS, key=key_states, shape=(loops,))
-    runs = closed_loops(system, stack, x0, horizon=QUADRATIC_HORIZON, steps=30)
-    if not runs.solved.all():
-        raise RuntimeError("a closed loop met an MPC problem that was not solved")
-    values = np.asarray(phi(runs.trajectories, QUADRATIC_Q, QUADRATIC_R)).mean(axis=1)
+    controllers = [known, *(r.model for r in models)]
+    runs = stacked_loops(system, controllers, x0, horizon=QUADRATIC_HORIZON, steps=30)
+    values = np.asarray(phi(runs, QUADRATIC_Q, QUADRATIC_R)).mean(axis=1)
     accuracies = [[100 * accuracy(r.model, t) for t in (test, inner)] for r in models]
     return np.column_stack([accuracies, values[1:] / values[0]])

@@ -19,7 +19,7 @@ from prefmpc.preferences import (
     by_criterion,
     lexicographic,
 )
-from prefmpc.studies.quadratic import RADIUS, error_rates
+from prefmpc.studies.quadratic import RADIUS, error_rates, solved, stacked_loops
 from prefmpc.systems import LinearSystem, oscillating_masses
 from prefmpc.training import FitResult, fit
 from prefmpc.trajectories import Trajectory, max_input, settling_time
@@ -159,16 +159,13 @@ def settling_case(
     coupled = QuadraticCost.random(system.nx, system.nu, key=key_random, shape=(loops,))
     diagonal = QuadraticCost(*diagonal_weights(key_random, loops))
     settings = {"horizon": SETTLING_HORIZON, "steps": SETTLING_STEPS}
-    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *learned)
-    many = closed_loops(system, stack, x0, **settings)
+    many = stacked_loops(system, learned, x0, **settings)
     pairs = jax.tree.map(lambda *leaves: np.concatenate(leaves), coupled, diagonal)
-    each = closed_loops(system, pairs, np.tile(x0, (2, 1))[:, None], **settings)
-    if not (many.solved.all() and each.solved.all()):
-        raise RuntimeError("a closed loop met an MPC problem that was not solved")
+    each = solved(closed_loops(system, pairs, np.tile(x0, (2, 1))[:, None], **settings))
 
     random = {
-        "Random": each.trajectories[:loops, 0],
-        "Random, diagonal": each.trajectories[loops:, 0],
+        "Random": each[:loops, 0],
+        "Random, diagonal": each[loops:, 0],
     }
     runs: dict[Variant, dict[str, Trajectory]] = {}
     table = np.full((2, len(SETTLING_ROWS), len(SETTLING_COLUMNS)), np.nan)
@@ -176,7 +173,7 @@ def settling_case(
         offset = v * len(SETTLING_SIZES)
         runs[variant] = dict(random)
         for i, name in enumerate(SETTLING_ROWS[2:]):
-            runs[variant][name] = many.trajectories[offset + i]
+            runs[variant][name] = many[offset + i]
         for r, name in enumerate(SETTLING_ROWS):
             kappa = settling_time(runs[variant][name], EPSILON)
             table[v, r, 3:] = np.median(kappa), kappa.max(), max_input(runs[variant][name]).mean()
@@ -236,10 +233,7 @@ def ties_case(*, key: Any, size: int = 1000, loops: int = 200) -> np.ndarray:
             start = np.random.default_rng(seeds[1])
             models.append(fit(data, key=start, selection="training_loss").model)
         ties.append(100 * (1 - len(data) / size))
-    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *models)
-    runs = closed_loops(system, stack, x0, horizon=SETTLING_HORIZON, steps=SETTLING_STEPS)
-    if not runs.solved.all():
-        raise RuntimeError("a closed loop met an MPC problem that was not solved")
-    kappa = np.median(settling_time(runs.trajectories, EPSILON), axis=1).reshape(-1, 2)
-    force = max_input(runs.trajectories).mean(axis=1).reshape(-1, 2)
+    runs = stacked_loops(system, models, x0, horizon=SETTLING_HORIZON, steps=SETTLING_STEPS)
+    kappa = np.median(settling_time(runs, EPSILON), axis=1).reshape(-1, 2)
+    force = max_input(runs).mean(axis=1).reshape(-1, 2)
     return np.column_stack([ties, kappa[:, 0], force[:, 0], kappa[:, 1], force[:, 1]])
