@@ -6,7 +6,7 @@ objective of the controller.
 """
 
 from prefmpc.comparisons import Comparisons
-from prefmpc.convex import MapResult, WishartPrior, bryson, fit_map
+from prefmpc.convex import MapResult, fit_map, fit_maps
 from prefmpc.evaluation import (
     ClosedLoops,
     WinRate,
@@ -16,6 +16,8 @@ from prefmpc.evaluation import (
     simulate,
     win_rate,
 )
+from prefmpc.global_fit import GlobalResult, fit_global
+from prefmpc.losses import FitError
 from prefmpc.models import CostModel, QuadraticCost
 from prefmpc.mpc import BatchedMPC, LinearMPC, MPCError, MPCSolution
 from prefmpc.pools import lqr_pool, random_states, random_weights
@@ -30,9 +32,11 @@ from prefmpc.preferences import (
     logistic,
     one_by_one,
 )
+from prefmpc.priors import WishartPrior, blocks, bryson
+from prefmpc.selection import PriorChoice, choose_prior
 from prefmpc.sets import Polyhedron
 from prefmpc.systems import LinearSystem, oscillating_masses
-from prefmpc.training import FitError, FitResult, fit
+from prefmpc.training import FitResult, fit
 from prefmpc.trajectories import (
     Moments,
     Trajectory,
@@ -43,6 +47,7 @@ from prefmpc.trajectories import (
     settling_text,
     settling_time,
 )
+from prefmpc.uncertainty import Interval, Posterior, posterior
 
 __version__ = "0.1.0"
 
@@ -54,6 +59,8 @@ __all__ = [
     "Criterion",
     "FitError",
     "FitResult",
+    "GlobalResult",
+    "Interval",
     "LinearMPC",
     "LinearSystem",
     "MPCError",
@@ -61,7 +68,9 @@ __all__ = [
     "MapResult",
     "Moments",
     "Polyhedron",
+    "Posterior",
     "Preference",
+    "PriorChoice",
     "QuadraticCost",
     "QuadraticPreference",
     "SettlingTimePreference",
@@ -69,12 +78,16 @@ __all__ = [
     "WinRate",
     "WishartPrior",
     "accuracy",
+    "blocks",
     "bryson",
     "by_criterion",
+    "choose_prior",
     "closed_loops",
     "erring",
     "fit",
+    "fit_global",
     "fit_map",
+    "fit_maps",
     "lexicographic",
     "logistic",
     "lqr_pool",
@@ -82,6 +95,7 @@ __all__ = [
     "one_by_one",
     "oscillating_masses",
     "phi",
+    "posterior",
     "random_states",
     "random_weights",
     "regret",

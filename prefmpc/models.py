@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cache
 from typing import Any, Protocol, runtime_checkable
 
 import jax
@@ -138,7 +139,7 @@ class QuadraticCost:
         """Return the paper's bounds on θ as two models: diagonal ≥ 0.01, its first entry ≥ 1."""
 
         def lower(theta: Any, first: float) -> Any:
-            rows, columns = np.tril_indices(_size(theta))
+            rows, columns = lower_triangle(_size(theta))
             bound = np.where(rows == columns, DIAGONAL_MIN, -np.inf)
             bound[0] = first
             return np.broadcast_to(bound, theta.shape)
@@ -163,6 +164,12 @@ class QuadraticCost:
 register_pytree(QuadraticCost)
 
 
+@cache
+def lower_triangle(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows and columns of the lower triangle of an n × n matrix, row by row."""
+    return np.tril_indices(n)
+
+
 def _size(theta: Any) -> int:
     """Return n for a packed triangle of n (n + 1) / 2 entries."""
     return (int(np.sqrt(8 * theta.shape[-1] + 1)) - 1) // 2
@@ -170,7 +177,7 @@ def _size(theta: Any) -> int:
 
 def _pack(matrix: Any) -> Any:
     """Return the lower triangle (..., n (n + 1) / 2), row by row."""
-    rows, columns = np.tril_indices(matrix.shape[-1])
+    rows, columns = lower_triangle(matrix.shape[-1])
     return matrix[..., rows, columns]
 
 
@@ -181,7 +188,7 @@ def _join(first: Any, second: Any) -> Any:
 def _unpack(theta: Any) -> Any:
     """Return the lower triangular matrix (..., n, n) with the entries ``theta``."""
     n = _size(theta)
-    rows, columns = np.tril_indices(n)
+    rows, columns = lower_triangle(n)
     # A product with a constant, since XLA's scatter (and its gradient) is slow on a CPU.
     places = np.zeros((rows.size, n * n))
     places[np.arange(rows.size), rows * n + columns] = 1.0

@@ -1,4 +1,4 @@
-"""Learning σ from comparisons: the logistic loss and the paper's recipe, all restarts at once."""
+"""Learning σ from comparisons by the paper's recipe, all restarts at once."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import dataclasses
 import time
 import warnings
 from functools import partial
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -17,79 +17,22 @@ from prefmpc._checks import instance, nonnegative, positive_int, require_x64, to
 from prefmpc._lbfgsb import minimise
 from prefmpc._random import generator
 from prefmpc.comparisons import Comparisons
+from prefmpc.losses import (
+    FitError,
+    PairData,
+    cross_entropy,
+    logits,
+    objective,
+    padded_size,
+    pair_data,
+)
 from prefmpc.models import CostModel, QuadraticCost
 
 Selection = Literal["validation", "training_loss", "leaky_test_accuracy"]
 Status = Literal["converged", "max_iterations", "out_of_bounds", "not_finite"]
 
-SMALLEST_SHAPE = 1024
-"""Data sets are padded to this many pairs, or to the next power of two above it."""
-
-
 BOUND_ROUNDING = 1e-9
 """A weight this little outside its bounds is clipped; further outside, the restart is refused."""
-
-
-class FitError(RuntimeError):
-    """No restart gave a model that may be used."""
-
-
-class PairData(NamedTuple):
-    """Pairs ready for the loss: features of both sides, labels and weights, leading size n.
-
-    For a model that is linear in its features ``first`` is None and ``second`` the difference.
-    """
-
-    first: Any
-    second: Any
-    labels: Any
-    weights: Any
-
-
-def pair_data(model: Any, comparisons: Comparisons, size: int | None = None) -> PairData:
-    """Compute the features of all pairs once, padded with pairs of weight 0 to ``size``."""
-    n = len(comparisons)
-    size = n if size is None else size
-    with np.errstate(over="ignore"):  # said in one sentence below
-        features = jax.tree.map(np.asarray, model.features(comparisons.trajectories))
-    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(features)):
-        raise ValueError("trajectories must have finite features, got NaN or an overflow")
-    padding = np.zeros(size - n, dtype=int)
-    i = np.concatenate([comparisons.first, padding])
-    j = np.concatenate([comparisons.second, padding])
-    first = jax.tree.map(lambda leaf: leaf[i], features)
-    second = jax.tree.map(lambda leaf: leaf[j], features)
-    if model.linear_in_features:
-        first, second = None, jax.tree.map(np.subtract, second, first)
-    labels = np.concatenate([comparisons.labels, padding])
-    return PairData(first, second, labels, np.concatenate([np.ones(n), padding]))
-
-
-def logits(model: Any, data: PairData) -> Any:
-    """Return σ(T_second) − σ(T_first) (n,): the log-odds that the first is preferred.
-
-    Implements the exponent of eq. (4) of arXiv 2511.22502.
-    """
-    if data.first is None:
-        return model.score(data.second)
-    return model.score(data.second) - model.score(data.first)
-
-
-def cross_entropy(model: Any, data: PairData) -> Any:
-    """Return the weighted mean of the logistic loss, the sum of eq. (6) of arXiv 2511.22502.
-
-    Computed from the log-odds, so that it neither overflows nor saturates.
-    """
-    losses = optax.sigmoid_binary_cross_entropy(logits(model, data), data.labels)
-    return jnp.vdot(data.weights, losses) / jnp.sum(data.weights)
-
-
-def objective(model: Any, data: PairData, l2: Any = 1e-6, l1: Any = 0.0) -> Any:
-    """Return cross-entropy + l2·‖θ‖² + l1·‖θ‖₁: eq. (6) of arXiv 2511.22502, with ρ = ``l2``."""
-    theta = jax.tree.leaves(model)
-    ridge = sum(jnp.vdot(leaf, leaf) for leaf in theta)
-    lasso = sum(jnp.sum(jnp.abs(leaf)) for leaf in theta)
-    return cross_entropy(model, data) + l2 * ridge + l1 * lasso
 
 
 @dataclasses.dataclass(frozen=True)
@@ -209,7 +152,7 @@ def fit(
     starts = _starts(comparisons, initial, restarts, rng)
 
     n = len(comparisons)
-    data = pair_data(starts, comparisons, _padded_size(n))
+    data = pair_data(starts, comparisons, padded_size(n))
     held_out = np.zeros(0, dtype=int)
     if selection == "validation":
         order = rng.permutation(n)
@@ -334,14 +277,9 @@ def _validation(models: Any, data: PairData) -> tuple[Any, Any]:
 
 
 def _scores(models: Any, comparisons: Comparisons, kind: str) -> np.ndarray:
-    data = pair_data(models, comparisons, _padded_size(len(comparisons)))
+    data = pair_data(models, comparisons, padded_size(len(comparisons)))
     loss, errors = _validation(models, data)
     return np.asarray(loss if kind == "loss" else errors)
-
-
-def _padded_size(n: int) -> int:
-    """Return the shape that ``n`` pairs are padded to, so that few shapes need compiling."""
-    return max(SMALLEST_SHAPE, 1 << (n - 1).bit_length())
 
 
 def _starts(

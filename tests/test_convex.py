@@ -19,9 +19,11 @@ from prefmpc import (
     Trajectory,
     WishartPrior,
     accuracy,
+    blocks,
     bryson,
     erring,
     fit_map,
+    fit_maps,
     lqr_pool,
     oscillating_masses,
     second_moments,
@@ -33,6 +35,7 @@ PERSON = QuadraticPreference(QUADRATIC_Q, QUADRATIC_R)
 CLEAN = Comparisons.random(POOL, PERSON, 50, key=jax.random.key(2001))
 NOISY = Comparisons.random(POOL, erring(PERSON, 0.2), 50, key=jax.random.key(2002))  # soft labels
 BRYSON = bryson(RADIUS, [1, 1])
+SMALL = Comparisons(Trajectory(np.ones((2, 3, 1)), np.ones((2, 2, 1))), [0], [1], [1.0])
 COUPLED = WishartPrior(
     30 * np.eye(6) + 5 * np.ones((6, 6)), np.array([[20.0, 3], [3, 10]]), strength=2.5
 )
@@ -101,6 +104,114 @@ def test_no_answer_leaves_the_mode_and_little_prior_leaves_the_data():
     np.testing.assert_allclose(strong.Q, BRYSON.Q, atol=0.01 * BRYSON.Q.max())
 
 
+def test_many_problems_at_once_are_the_same_as_one_by_one():
+    priors = [BRYSON, COUPLED, bryson(RADIUS, [1, 1], scale=50, strength=0.1)]
+    sets = [CLEAN, NOISY.subset(np.arange(20)), NOISY]
+    together = [*fit_maps(CLEAN, priors), *fit_maps(sets, COUPLED), *fit_maps(sets, priors)]
+    alone = [fit_map(CLEAN, p) for p in priors] + [fit_map(d, COUPLED) for d in sets]
+    alone += [fit_map(d, p) for d, p in zip(sets, priors, strict=True)]
+    for one, many in zip(alone, together, strict=True):
+        assert many.success
+        assert many.objective == pytest.approx(one.objective, rel=1e-9)
+        assert many.log_likelihood == pytest.approx(one.log_likelihood, rel=1e-5)
+        np.testing.assert_allclose(many.Q, one.Q, atol=1e-5 * np.abs(one.Q).max())
+
+
+def test_block_diagonal_and_sparse_minima_are_stationary():
+    coupled = blocks([[0, 3], [1, 4], [2, 5]], [[0], [1]])
+    chain = np.abs(np.subtract.outer(np.arange(6), np.arange(6))) <= 1  # tridiagonal
+    for masks in (coupled, (chain, np.ones((2, 2), bool))):
+        result = fit_map(NOISY, BRYSON, structure=masks)
+        assert result.success
+        for W, mask in zip((result.Q, result.R), masks, strict=True):
+            assert (W[~mask] == 0).all()
+            assert (W[mask] != 0).all()
+        for i, j in zip(*np.nonzero(np.tril(masks[0])), strict=True):
+            E = np.zeros((6, 6))
+            E[i, j] = E[j, i] = 1e-4 * np.sqrt(result.Q[i, i] * result.Q[j, j])
+            at = [minus_log_posterior(result.Q + s * E, result.R, NOISY, BRYSON) for s in (-1, 1)]
+            assert abs(at[1] - at[0]) / 2e-4 < 1e-4
+            assert min(at) > result.objective
+    assert fit_map(NOISY, BRYSON).objective < result.objective
+
+
+def test_outputs_only_is_the_same_as_learning_from_a_plant_with_these_states():
+    C = oscillating_masses().C
+    assert C.shape == (3, 6)
+    prior = bryson([0.3, 0.2, 0.1], [1, 1])
+    result = fit_map(NOISY, prior, outputs=C)
+    seen = Trajectory(POOL.x @ C.T, POOL.u)
+    by_hand = fit_map(Comparisons(seen, NOISY.first, NOISY.second, NOISY.labels), prior)
+    np.testing.assert_allclose(result.Q, C.T @ by_hand.Q @ C, rtol=1e-10)
+    assert result.objective == by_hand.objective
+    np.testing.assert_allclose(result.model(POOL), by_hand.model(seen), rtol=1e-10)
+    np.testing.assert_allclose(result.std_R, by_hand.std_R, rtol=1e-10)
+
+
+def test_laplace_deviations_are_those_of_the_inverse_hessian_by_finite_differences():
+    result = fit_map(NOISY, COUPLED)
+    pairs = [(0, i, j) for i in range(6) for j in range(i + 1)] + [(1, 0, 0), (1, 1, 0), (1, 1, 1)]
+
+    def moved(entries):
+        W = [result.Q.copy(), result.R.copy()]
+        for (which, i, j), step in entries:
+            W[which][i, j] += step
+            W[which][j, i] = W[which][i, j]
+        return minus_log_posterior(*W, NOISY, COUPLED)
+
+    scale = [
+        1e-3 * np.sqrt(W[i, i] * W[j, j]) for k, i, j in pairs for W in [(result.Q, result.R)[k]]
+    ]
+    H = np.zeros((24, 24))
+    for a in range(24):
+        for b in range(a + 1):
+            signs = [(s, t) for s in (1, -1) for t in (1, -1)]
+            values = [
+                s * t * moved([(pairs[a], s * scale[a]), (pairs[b], t * scale[b])])
+                for s, t in signs
+            ]
+            H[a, b] = H[b, a] = sum(values) / (4 * scale[a] * scale[b])
+    std = np.sqrt(np.diag(np.linalg.inv(H)))
+    for value, (which, i, j) in zip(std, pairs, strict=True):
+        assert (result.std_Q, result.std_R)[which][i, j] == pytest.approx(value, rel=2e-3)
+
+
+def test_a_less_sure_person_has_smaller_weights_and_the_same_wishes():
+    result = fit_map(NOISY, COUPLED)
+    half = fit_map(
+        Comparisons(  # log-odds of half the size: trajectories shrunk by the square root
+            Trajectory(POOL.x / 2**0.5, POOL.u / 2**0.5), NOISY.first, NOISY.second, NOISY.labels
+        ),
+        WishartPrior(2 * COUPLED.Q, 2 * COUPLED.R, COUPLED.strength),
+    )
+    np.testing.assert_allclose(half.Q, 2 * result.Q, rtol=1e-6)
+    assert half.sharpness == pytest.approx(result.sharpness, rel=1e-6)
+    W0 = np.trace(np.linalg.solve(COUPLED.Q, result.normalised.Q))
+    W0 += np.trace(np.linalg.solve(COUPLED.R, result.normalised.R))
+    assert W0 == pytest.approx(8)
+
+
+def test_the_nearest_diagonal_explains_less_and_is_the_diagonal_minimum():
+    result = fit_map(NOISY, COUPLED)
+    nearest = result.nearest_diagonal()
+    assert nearest.log_likelihood < result.log_likelihood < 0
+    assert np.count_nonzero(nearest.Q) == 6
+    assert np.count_nonzero(nearest.R) == 2
+    x, u = POOL.x[:, :-1], POOL.u
+    sigma = np.einsum("tki,ij,tkj->t", x, result.Q, x) + np.einsum("tki,ij,tkj->t", u, result.R, u)
+    z = sigma[NOISY.second] - sigma[NOISY.first]
+    assert result.log_likelihood == pytest.approx(-np.sum(np.logaddexp(0, z) - NOISY.labels * z))
+
+
+@pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
+@pytest.mark.parametrize("strength", [0.01, 1.0, 100.0])
+def test_every_prior_is_solved_in_few_steps(scale, strength):
+    for data in (CLEAN, NOISY.sampled(key=jax.random.key(1))):
+        result = fit_map(data, bryson(RADIUS, [1, 1], scale=scale, strength=strength))
+        assert result.success, result.message
+        assert result.iterations <= 60
+
+
 def test_units_do_not_matter():
     # The same experiment in millimetres: x is 1000 times as large, Q a millionth.
     big = Trajectory(1000 * POOL.x, POOL.u, 1000 * POOL.y)
@@ -166,8 +277,28 @@ def test_an_unfinished_solve_says_so_and_hands_out_no_model():
         (lambda: fit_map(CLEAN, bryson([1], [1])), "prior must weigh 6 states and 2 inputs, got Q"),
         (lambda: fit_map(CLEAN, BRYSON, tol=-1), "tol must be finite and at least 0"),
         (lambda: fit_map(CLEAN, BRYSON, max_iterations=0), "max_iterations must be a whole number"),
-        (lambda: fit_map(CLEAN, BRYSON, structure="banded"), 'must be "full" or "diagonal", got'),
-        (lambda: fit_map(CLEAN, COUPLED, structure="diagonal"), "prior must be diagonal"),
+        (lambda: fit_map(CLEAN, BRYSON, structure="banded"), 'must be "full", "diagonal" or two'),
+        (lambda: fit_map(CLEAN, COUPLED, structure="diagonal"), "prior must fit structure .diag"),
+        (lambda: fit_map(CLEAN, BRYSON, structure=(np.eye(6) > 0, 1)), "mask .2, 2. for R"),
+        (
+            lambda: fit_map(CLEAN, BRYSON, structure=(np.eye(6), np.eye(2))),
+            "bool mask .6, 6. for Q",
+        ),
+        (lambda: fit_map(CLEAN, BRYSON, outputs=np.eye(3)), "outputs must have 6 columns"),
+        (
+            lambda: fit_map(CLEAN, BRYSON, outputs=np.eye(6)[:3]),
+            "must weigh 3 outputs and 2 inputs",
+        ),
+        (lambda: fit_maps([CLEAN, POOL], BRYSON), "comparisons must be a Comparisons, got Traj"),
+        (lambda: fit_maps(CLEAN, [BRYSON, 1]), "priors must be a WishartPrior, got int"),
+        (lambda: fit_maps([CLEAN] * 2, [BRYSON] * 3), "must be equally many, .* got 2 and 3"),
+        (lambda: fit_maps(CLEAN, []), "must be equally many"),
+        (
+            lambda: fit_maps([CLEAN, SMALL], BRYSON),
+            "must all have 6 states and 2 inputs, got 1 and",
+        ),
+        (lambda: blocks([[0, 1], [1]], [[0]]), "states must name each index 0 to 2 in one group"),
+        (lambda: blocks([[0]], []), "inputs must name each index"),
         (lambda: WishartPrior(-np.eye(2), np.eye(1)), "Q must be positive definite"),
         (lambda: WishartPrior(np.eye(2), np.zeros((1, 1))), "R must be positive definite"),
         (lambda: WishartPrior(np.ones((2, 3)), np.eye(1)), "Q must be a square matrix"),

@@ -118,8 +118,18 @@ LAYERS = {
     "preferences": HELPERS | {"trajectories"},
     "comparisons": HELPERS | {"trajectories", "preferences"},
     "models": HELPERS | {"systems", "sets", "trajectories", "pools"},
-    "convex": HELPERS | {"trajectories", "preferences", "comparisons", "models", "training"},
-    "training": HELPERS | {"_lbfgsb", "trajectories", "models", "comparisons"},
+    "losses": HELPERS | {"comparisons"},
+    "training": HELPERS | {"_lbfgsb", "trajectories", "models", "comparisons", "losses"},
+    "priors": HELPERS,
+    "_newton": HELPERS | {"trajectories", "comparisons", "models", "priors"},
+    "_chart": HELPERS | {"_newton"},
+    "uncertainty": {
+        *HELPERS,
+        *("_newton", "_chart", "trajectories", "comparisons", "models", "convex"),
+    },
+    "selection": HELPERS | {"_newton", "_chart", "comparisons", "convex", "losses", "priors"},
+    "global_fit": HELPERS | {"_newton", "comparisons", "models", "losses"},
+    "convex": HELPERS | {"_newton", "comparisons", "models", "losses", "priors"},
     "mpc": HELPERS | {"systems", "sets", "trajectories", "models", "mpc"},
     "evaluation": {
         *HELPERS,
@@ -160,12 +170,16 @@ MADE = {
         "CostModel",
         "FitError",
         "FitResult",
+        "GlobalResult",
+        "Interval",
         "MPCError",
         "MPCSolution",
         "MapResult",
         "Moments",
+        "Posterior",
+        "PriorChoice",
+        "WinRate",
     ),
-    "WinRate",
 }
 TYPES = {"Criterion", "Preference"}
 

@@ -26,8 +26,8 @@ from prefmpc import (
 )
 from prefmpc._lbfgsb import minimise
 from prefmpc._pytree import register_pytree
+from prefmpc.losses import PairData, cross_entropy, logits, objective, pair_data
 from prefmpc.studies import error_rates
-from prefmpc.training import PairData, cross_entropy, objective, pair_data
 
 KEY = jax.random.key(2000)
 RNG = np.random.default_rng(0)
@@ -157,7 +157,7 @@ def test_a_model_of_ones_own():
     assert isinstance(model, CostModel)
     sizes = 0.5 * np.abs(POOL.x[:, :-1]).sum((-1, -2))
     data = pair_data(model, FEW, 16)
-    z = np.asarray(training.logits(model, data))[:4]
+    z = np.asarray(logits(model, data))[:4]
     np.testing.assert_allclose(z, sizes[FEW.second] - sizes[FEW.first], rtol=1e-12)
 
 

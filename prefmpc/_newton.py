@@ -1,0 +1,373 @@
+"""The convex problem of the most probable (Q, R) in the form that Newton's method wants."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+
+from prefmpc._checks import array_module, to_numpy
+from prefmpc.comparisons import Comparisons
+from prefmpc.priors import WishartPrior
+from prefmpc.trajectories import Trajectory, second_moments
+
+
+class Entries(NamedTuple):
+    """The free entries w (p,) of W = blkdiag(Q, R) (d, d), lower triangle."""
+
+    rows: Any
+    columns: Any
+    place: Any
+    """(d, d): which entry of w stands where in W; p, one past the end, for a zero."""
+
+    @classmethod
+    def of(cls, rows: np.ndarray, columns: np.ndarray) -> Entries:
+        """Number the entries."""
+        place = np.full((rows.max() + 1,) * 2, rows.size)
+        place[rows, columns] = place[columns, rows] = np.arange(rows.size)
+        return cls(rows, columns, place)
+
+    def matrix(self, w: Any) -> Any:
+        """Return W (..., d, d) from w (..., p)."""
+        xp = array_module(w)
+        return xp.concatenate([w, xp.zeros_like(w[..., :1])], axis=-1)[..., self.place]
+
+    @property
+    def count(self) -> Any:
+        """How often each entry stands in W (p,): 1 on the diagonal, else 2."""
+        return jnp.where(self.rows == self.columns, 1.0, 2.0)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
+    """Minimise Σ cross-entropy(gapᵀw) − strength·[log det W − tr(mode⁻¹W)] over W ≻ 0.
+
+    In units in which a prior's mode has a unit diagonal: nothing then depends on the units of
+    x and u. W in the user's units is ``W / unit / unit[:, None]``.
+    """
+
+    entries: Entries
+    unit: np.ndarray
+    """(d,)"""
+    gap: np.ndarray
+    """(p, size): second moments of the second trajectory minus those of the first."""
+    labels: np.ndarray
+    weights: np.ndarray
+    """(size,): 1 for a comparison, 0 for padding."""
+    mode: np.ndarray
+    strength: float
+
+    @property
+    def log_unit(self) -> float:
+        """log det W in the problem's units minus that in the user's."""
+        return 2 * float(np.log(self.unit).sum())
+
+    def in_user_units(self, w: np.ndarray) -> np.ndarray:
+        """Return matrices W (..., d, d) in the user's units from w (..., p)."""
+        return np.asarray(self.entries.matrix(w)) / self.unit / self.unit[:, None]
+
+
+def signals(trajectories: Trajectory, outputs: np.ndarray | None) -> Trajectory:
+    """Return the trajectories of what is weighed: the states, or y = ``outputs`` @ x."""
+    if outputs is None:
+        return trajectories
+    return Trajectory(np.asarray(trajectories.x) @ outputs.T, trajectories.u)
+
+
+def scaled_moments(
+    trajectories: Trajectory, rows: np.ndarray, columns: np.ndarray, unit: np.ndarray
+) -> np.ndarray:
+    """Return the second moments (p, n_t) that belong to the free entries, in the given units."""
+    with np.errstate(over="ignore"):
+        moments = _block_diagonal(*(np.asarray(S) for S in second_moments(trajectories)))
+    if not np.isfinite(moments).all():
+        raise ValueError("comparisons must have finite second moments, got an overflow")
+    count = np.where(rows == columns, 1.0, 2.0)
+    return moments[:, rows, columns].T * (count / (unit[rows] * unit[columns]))[:, None]
+
+
+def build(
+    comparisons: Comparisons,
+    priors: Sequence[WishartPrior],
+    entries: Entries,
+    outputs: np.ndarray | None,
+    size: int,
+) -> list[Problem]:
+    """Prepare one problem for each prior, all in the units of the first.
+
+    Padded to ``size`` comparisons with some of weight 0.
+    """
+    n = len(comparisons)
+    modes = [_block_diagonal(prior.Q, prior.R) for prior in priors]
+    unit = 1 / np.sqrt(np.diag(modes[0]))
+    gap = np.zeros((entries.rows.size, size))
+    gap[:, :n] = pair_gaps(comparisons, entries, unit, outputs)
+    labels, weights = np.zeros(size), np.zeros(size)
+    labels[:n], weights[:n] = comparisons.labels, 1.0
+    return [
+        Problem(
+            entries, unit, gap, labels, weights, W0 * unit * unit[:, None], float(prior.strength)
+        )
+        for W0, prior in zip(modes, priors, strict=True)
+    ]
+
+
+def pair_gaps(
+    comparisons: Comparisons, entries: Entries, unit: np.ndarray, outputs: np.ndarray | None
+) -> np.ndarray:
+    """Return the differences (p, n) of second moments, in the given units."""
+    trajectories = signals(comparisons.trajectories, outputs)
+    pool = scaled_moments(trajectories, entries.rows, entries.columns, unit)
+    gap = pool.take(comparisons.second, axis=1)
+    gap -= pool.take(comparisons.first, axis=1)
+    return gap
+
+
+def _block_diagonal(Q: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Return blkdiag(Q, R) (..., d, d)."""
+    n, d = Q.shape[-1], Q.shape[-1] + R.shape[-1]
+    W = np.zeros((*Q.shape[:-2], d, d))
+    W[..., :n, :n], W[..., n:, n:] = Q, R
+    return W
+
+
+def loss_and_slopes(z: Any, labels: Any, weights: Any) -> tuple[Any, Any, Any]:
+    """Return Σ cross-entropy, and its first and second derivatives with respect to z (size,)."""
+    p = jax.nn.sigmoid(z)
+    return loss(z, labels, weights), weights * (p - labels), weights * p * (1 - p)
+
+
+def loss(z: Any, labels: Any, weights: Any) -> Any:
+    """Return Σ cross-entropy."""
+    # log(1 + e) instead of log1p(e): below 1e-16 nothing is left in the sum anyway, and faster.
+    return weights @ (jnp.maximum(z, 0) + jnp.log(1 + jnp.exp(-jnp.abs(z))) - labels * z)
+
+
+def product_hessian(A: Any, B: Any, entries: Entries) -> Any:
+    """Return the matrix (p, p) of the quadratic form tr(dW A dW B), for symmetric A and B (d, d).
+
+    With A = W⁻¹ and B = strength·W⁻¹ it is the Hessian of −strength·log det W.
+    """
+    i, j = entries.rows, entries.columns
+
+    def part(A: Any, B: Any) -> Any:
+        return A[i[:, None], i] * B[j[:, None], j] + A[i[:, None], j] * B[j[:, None], i]
+
+    return entries.count[:, None] * entries.count / 4 * (part(A, B) + part(B, A))
+
+
+class Minimum(NamedTuple):
+    """What `newton` found: w (p,), the objective, its decrement λ²/2 and Hessian (p, p)."""
+
+    w: Any
+    objective: Any
+    log_likelihood: Any
+    decrement: Any
+    hessian: Any
+    steps: Any
+
+
+TO_BOUNDARY = 0.95
+"""No step goes further towards a singular matrix than this share of the way."""
+
+SHRINK = 4.0
+"""What scale and strength of the prior come nearer by, from one problem of the path to the next."""
+
+LOG_ODDS = 100.0
+"""Size of the log-odds where the path begins: more, and wrong ones have no curvature left."""
+
+
+ALMOST = 1e-4
+"""The dual's Hessian is trusted to this decrement; from there on the exact one is used."""
+
+
+class _State(NamedTuple):
+    w: Any
+    z: Any
+    dual: Any
+    """Z (d, d): strength·W⁻¹ in the end."""
+    strength: Any
+    tightness: Any
+    """1 / scale of the prior's mode, relative to the wanted scale."""
+    objective: Any
+    decrement: Any
+    hessian: Any
+    steps: Any
+    stuck: Any
+
+
+def newton(
+    gap: Any,
+    labels: Any,
+    weights: Any,
+    entries: Entries,
+    mode: Any,
+    wanted: Any,
+    tol: Any,
+    limit: Any,
+) -> Minimum:
+    """Minimise by primal-dual Newton steps along a path of ever weaker priors.
+
+    The path begins with a prior of so small a scale that no answer is far from the model, and so
+    strong that its mode is nearly the minimum, and ends with the wanted one. The curvature of
+    −log det W is taken as W⁻¹⊗Z with a dual Z instead of strength·W⁻¹⊗W⁻¹: a small eigenvalue of
+    W then grows to its place at once, where it would else double in each step. At the end of the
+    path the exact Hessian takes over, and its decrement is the certificate.
+
+    The calls to LAPACK depend on each other, one after the other: two that do not can wait for
+    each other forever in a small thread pool.
+    """
+    rows, columns, count = entries.rows, entries.columns, entries.count
+    eye = jnp.eye(mode.shape[0])
+
+    def invert(W: Any) -> Any:
+        root = solve_triangular(jnp.linalg.cholesky(W), eye, lower=True)
+        return root.T @ root
+
+    def packed(M: Any) -> Any:  # the derivative of tr(M W) with respect to w
+        return count * M[rows, columns]
+
+    precision = packed(invert(mode))
+
+    def objective(w: Any, z: Any, strength: Any, tightness: Any) -> Any:
+        # NaN outside of the cone, where Cholesky fails.
+        L = jnp.linalg.cholesky(entries.matrix(w))
+        log_det = 2 * jnp.sum(jnp.log(jnp.diag(L)))
+        return loss(z, labels, weights) + strength * (tightness * (precision @ w) - log_det)
+
+    def solve_newton(hessian: Any, gradient: Any) -> tuple[Any, Any]:
+        unit = 1 / jnp.sqrt(jnp.diag(hessian))
+        L = jnp.linalg.cholesky(hessian * unit * unit[:, None])
+        half = solve_triangular(L, gradient * unit, lower=True)
+        return -unit * solve_triangular(L, half, lower=True, trans=1), half @ half / 2
+
+    def longest(M: Any, dM: Any) -> Any:
+        """Return a step length that keeps M + t·dM inside of the cone."""
+
+        def outside(t: Any) -> Any:
+            trial = jnp.linalg.cholesky(M + t / TO_BOUNDARY * dM)
+            return ~jnp.isfinite(trial[-1, -1]) & (t > 1e-9)
+
+        return jax.lax.while_loop(outside, lambda t: 0.7 * t, 1.0)
+
+    def unfinished(state: _State) -> Any:
+        return (state.steps < limit) & ~small(state) & ~state.stuck
+
+    def small(state: _State) -> Any:
+        return state.decrement <= tol * (1 + jnp.abs(state.objective))
+
+    def move(state: _State) -> _State:
+        w, z, dual = state.w, state.z, state.dual
+        strength, tightness = state.strength, state.tightness
+        arrived = (strength <= wanted) & (tightness <= 1)
+        W = entries.matrix(w)
+        inverse = invert(W)
+        _, slope, curvature = loss_and_slopes(z, labels, weights)
+        both = jnp.concatenate([gap * curvature, slope[None]]) @ gap.T  # one pass over the data
+        gradient = both[-1] + strength * (tightness * precision - packed(inverse))
+        # Near the end Z = strength·W⁻¹ up to rounding; then the exact Hessian is as good.
+        last = arrived & (state.decrement <= ALMOST * (1 + jnp.abs(state.objective)))
+        partner = jnp.where(last, strength * inverse, dual)
+        hessian = both[:-1] + product_hessian(inverse, partner, entries)
+        step, decrement = solve_newton(hessian, gradient)
+
+        now = objective(w, z, strength, tightness)
+        dW, dz = entries.matrix(step), step @ gap
+        slack = 1e-13 * (1 + jnp.abs(now))
+
+        def refused(search: Any) -> Any:
+            t, trial = search
+            return ~(trial <= now - 0.05 * t * decrement + slack) & (t > 1e-12)
+
+        def shorter(search: Any) -> Any:
+            t = search[0] / 2
+            return t, objective(w + t * step, z + t * dz, strength, tightness)
+
+        t: Any
+        t, trial = jax.lax.while_loop(refused, shorter, (2 * longest(W, dW), jnp.nan))
+        turned = inverse @ dW @ dual
+        change = strength * inverse - dual - (turned + turned.T) / 2
+        t, change = jax.lax.optimization_barrier((t, change))  # LAPACK again: after the line search
+        dual = dual + longest(dual, change) * change
+
+        final = arrived & (decrement <= tol * (1 + jnp.abs(now)))
+        certified = final & last
+        stuck = ~certified & ~(t > 1e-12)
+        t = jnp.where(certified | stuck, 0.0, t)
+        near = decrement <= 3 * strength
+        factor = jnp.where(near, SHRINK, 1.0)
+        return _State(
+            w + t * step,
+            z + t * dz,
+            dual,
+            jnp.maximum(wanted, strength / factor),
+            jnp.maximum(1.0, tightness / factor),
+            jnp.where(t > 0, trial, now),
+            # Only the exact Hessian at the end of the path certifies anything.
+            jnp.where(arrived, jnp.where(last | ~final, decrement, ALMOST), jnp.inf),
+            hessian,
+            state.steps + (t > 0),
+            stuck,
+        )
+
+    w = mode[rows, columns]
+    z = w @ gap
+    size = jnp.sqrt(weights @ z**2 / jnp.maximum(jnp.sum(weights), 1.0))
+    tightness = jnp.maximum(1.0, size / LOG_ODDS)
+    w, z, inverse = w / tightness, z / tightness, invert(mode) * tightness
+    _, slope, _ = loss_and_slopes(z, labels, weights)
+    _, decrement = solve_newton(product_hessian(inverse, inverse, entries), gap @ slope)
+    strength = jnp.maximum(wanted, jnp.sqrt(2 * decrement))
+    start = _State(
+        w,
+        z,
+        strength * inverse,
+        strength,
+        tightness,
+        objective(w, z, strength, tightness),
+        jnp.inf,
+        jnp.zeros((w.size, w.size)),
+        0,
+        False,
+    )
+    end = jax.lax.while_loop(unfinished, move, start)
+    value = objective(end.w, end.z, wanted, 1.0)
+    nll = loss(end.z, labels, weights)
+    return Minimum(end.w, value, -nll, end.decrement, end.hessian, end.steps)
+
+
+_one = jax.jit(newton)
+_shared, _many = (
+    jax.jit(jax.vmap(newton, in_axes=(gap, 0, 0, None, 0, 0, None, None))) for gap in (None, 0)
+)
+
+
+def solve(problems: Sequence[Problem], tol: float, limit: int) -> list[Minimum]:
+    """Minimise all problems, which have the same shapes; more than one are solved side by side."""
+    first = problems[0]
+    if len(problems) == 1:
+        p = first
+        one = _one(p.gap, p.labels, p.weights, p.entries, p.mode, p.strength, tol, limit)
+        return [to_numpy(one)]
+    stack = {
+        name: np.stack([getattr(p, name) for p in problems])
+        for name in ("labels", "weights", "mode", "strength")
+    }
+    shared = all(p.gap is first.gap for p in problems)
+    gap = first.gap if shared else np.stack([p.gap for p in problems])
+    out = (_shared if shared else _many)(
+        gap,
+        stack["labels"],
+        stack["weights"],
+        first.entries,
+        stack["mode"],
+        stack["strength"],
+        tol,
+        limit,
+    )
+    return [Minimum(*parts) for parts in zip(*to_numpy(out), strict=True)]

@@ -1,0 +1,143 @@
+"""What is believed of Q and R before anybody answered, and which of their entries are free."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import numpy as np
+from jax.typing import ArrayLike
+
+from prefmpc._checks import finite_array, nonnegative, psd_matrix
+
+Structure = Literal["full", "diagonal"] | tuple[np.ndarray, np.ndarray]
+"""Which entries of Q and R may differ from zero: by name, or as two masks (see `blocks`)."""
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class WishartPrior:
+    """What is believed of Q and R before anybody answered: a mode, and how strongly.
+
+    log p(Q, R) = −strength·[tr(Q₀⁻¹Q) − log det Q + tr(R₀⁻¹R) − log det R] + const, the logarithm
+    of two Wishart densities with modes Q₀ and R₀. The *scale* of the mode says how sharp the
+    answers are expected to be: σ is in units of log-odds. There is no other noise parameter: a
+    person who answers with P = 1 / (1 + exp(−β·z)) and weights (Q, R) answers like one with
+    β = 1 and weights (βQ, βR), so β is fixed at 1.
+
+    Parameters
+    ----------
+    Q : array (nx, nx)
+    R : array (nu, nu)
+        Q₀ and R₀, symmetric positive definite.
+    strength : float
+        Positive. The weights are gamma distributed for one signal, with shape strength + 1.
+
+    Raises
+    ------
+    ValueError
+        If a mode is not positive definite or ``strength`` is not positive.
+    """
+
+    Q: np.ndarray
+    R: np.ndarray
+    strength: float = 1.0
+
+    def __post_init__(self) -> None:
+        for name in ("Q", "R"):
+            matrix = psd_matrix(name, getattr(self, name), definite=True)
+            if matrix.ndim != 2:
+                raise ValueError(f"{name} must be one matrix, got shape {matrix.shape}")
+            object.__setattr__(self, name, np.asarray(matrix))
+        if not nonnegative("strength", self.strength) > 0:
+            raise ValueError(f"strength must be positive, got {self.strength}")
+
+
+def bryson(
+    x_max: ArrayLike, u_max: ArrayLike, *, scale: float = 1.0, strength: float = 1.0
+) -> WishartPrior:
+    """Return the prior of an engineer who knows only the largest acceptable deviations.
+
+    Bryson's rule: each weight is 1 / (largest acceptable value)², so that a signal at its limit
+    costs ``scale`` in each step.
+
+    Parameters
+    ----------
+    x_max : array (nx,)
+    u_max : array (nu,)
+        Positive, in the units of x and u. For ``fit_map(..., outputs=C)``: of y and u.
+    scale, strength : float
+        Positive; see `WishartPrior`.
+    """
+    if not nonnegative("scale", scale) > 0:
+        raise ValueError(f"scale must be positive, got {scale}")
+    weights = []
+    for name, value in {"x_max": x_max, "u_max": u_max}.items():
+        limit = np.asarray(finite_array(name, value, ndim=1))
+        if limit.size == 0 or (limit <= 0).any():
+            raise ValueError(f"{name} must hold positive deviations, got {limit}")
+        weights.append(np.diag(scale / limit**2))
+    return WishartPrior(weights[0], weights[1], strength)
+
+
+def blocks(
+    states: Sequence[Sequence[int]], inputs: Sequence[Sequence[int]]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the masks of block-diagonal Q and R, for ``fit_map(..., structure=...)``.
+
+    Parameters
+    ----------
+    states, inputs : groups of indices
+        Each index in one group; only signals of one group are weighed together.
+        ``blocks([[0, 3], [1, 4], [2, 5]], [[0], [1]])`` couples the position of each of three
+        masses with its speed, and nothing else.
+
+    Returns
+    -------
+    bool array (nx, nx), bool array (nu, nu)
+    """
+    masks = []
+    for name, groups in {"states": states, "inputs": inputs}.items():
+        flat = [int(i) for group in groups for i in group]
+        if not flat or sorted(flat) != list(range(len(flat))):
+            raise ValueError(
+                f"{name} must name each index 0 to {max(len(flat) - 1, 0)} in one group, "
+                f"got {[list(group) for group in groups]}"
+            )
+        mask = np.zeros((len(flat), len(flat)), dtype=bool)
+        for group in groups:
+            mask[np.ix_(group, group)] = True
+        masks.append(mask)
+    return masks[0], masks[1]
+
+
+def free_entries(structure: Any, prior: WishartPrior) -> tuple[np.ndarray, np.ndarray]:
+    """Return rows and columns of the free entries of blkdiag(Q, R), lower triangle, row by row.
+
+    Raises a ValueError if ``structure`` is none, or if the prior's mode has an entry outside.
+    """
+    sizes = len(prior.Q), len(prior.R)
+    if isinstance(structure, str) and structure in ("full", "diagonal"):
+        masks = [np.ones((n, n), bool) if structure == "full" else np.eye(n) > 0 for n in sizes]
+    elif isinstance(structure, tuple) and len(structure) == 2:
+        masks = [np.asarray(mask) for mask in structure]
+        for name, mask, n in zip("QR", masks, sizes, strict=True):
+            good = mask.dtype == bool and mask.shape == (n, n) and (mask == mask.T).all()
+            if not good or not mask.diagonal().all():
+                raise ValueError(
+                    f"structure must hold a symmetric bool mask ({n}, {n}) for {name} with a True "
+                    f"diagonal, got shape {mask.shape} of {mask.dtype}"
+                )
+    else:
+        raise ValueError(
+            f'structure must be "full", "diagonal" or two masks (for Q, for R), got {structure!r}'
+        )
+    pairs = []
+    for name, mask, matrix, at in zip("QR", masks, (prior.Q, prior.R), (0, sizes[0]), strict=True):
+        if (matrix[~mask] != 0).any():
+            kind = structure if isinstance(structure, str) else "the masks"
+            raise ValueError(f"prior must fit structure ({kind}), its {name} has entries outside")
+        rows, columns = np.nonzero(np.tril(mask))
+        pairs.append((rows + at, columns + at))
+    (rows_Q, columns_Q), (rows_R, columns_R) = pairs
+    return np.concatenate([rows_Q, rows_R]), np.concatenate([columns_Q, columns_R])
