@@ -69,6 +69,7 @@ lab: $(LAB_STAMP)
 
 bench: $(STAMP)
 	@$(BIN)/python -W ignore benchmarks/speed.py
+	@$(BIN)/python -W ignore benchmarks/learning.py
 
 # ---- the checks ----
 

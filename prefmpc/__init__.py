@@ -6,7 +6,7 @@ objective of the controller.
 """
 
 from prefmpc.comparisons import Comparisons
-from prefmpc.convex import MapResult, fit_map, fit_maps
+from prefmpc.convex import Interval, MapResult, fit_map, fit_maps
 from prefmpc.evaluation import (
     ClosedLoops,
     WinRate,
@@ -47,7 +47,7 @@ from prefmpc.trajectories import (
     settling_text,
     settling_time,
 )
-from prefmpc.uncertainty import Interval, Posterior, posterior
+from prefmpc.uncertainty import Posterior, posterior
 
 __version__ = "0.1.0"
 

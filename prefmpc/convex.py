@@ -11,19 +11,30 @@ import dataclasses
 import time
 import warnings
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal, NamedTuple
 
+import jax
 import numpy as np
 from jax.typing import ArrayLike
+from scipy.special import ndtri
 
 from prefmpc._checks import finite_array, instance, nonnegative, positive_int, require_x64
-from prefmpc._newton import Entries, Minimum, Problem, build, solve
+from prefmpc._newton import Entries, Minimum, Problem, build, pair_gaps, solve
 from prefmpc.comparisons import Comparisons
 from prefmpc.losses import FitError, padded_size
 from prefmpc.models import QuadraticCost
 from prefmpc.priors import Structure, WishartPrior, free_entries
+from prefmpc.trajectories import Trajectory
 
 Status = Literal["converged", "max_iterations", "not_finite"]
+
+
+class Interval(NamedTuple):
+    """A posterior mean and the bounds of an interval about it, all of the same shape."""
+
+    mean: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -123,6 +134,33 @@ class MapResult:
         parts = split(basis, len(self.prior.Q), self.outputs)
         Q, R = (np.sqrt(np.einsum("aij,ab,bij->ij", P, covariance, P)) for P in parts)
         return Q, R
+
+    def probability(self, first: Trajectory, second: Trajectory, level: float = 0.9) -> Interval:
+        """Return P(first is preferred), and how sure we are of it, by Laplace's method.
+
+        The log-odds of a pair are linear in the weights, and so Gaussian if these are. Without
+        sampling, hence quick; `Posterior.probability` is better where answers are few.
+
+        Parameters
+        ----------
+        first, second : Trajectory
+            With equal batch shapes (...).
+        level : float
+            The share of the posterior between the bounds, with equal shares outside.
+
+        Returns
+        -------
+        Interval
+            Three arrays (...). The mean, of a logistic function of a Gaussian, is that of MacKay's
+            approximation.
+        """
+        self.check()
+        gap, batch, tail = new_gaps(self, first, second, level)
+        z = self.minimum.w @ gap
+        variance = np.einsum("an,an->n", gap, np.linalg.solve(self.minimum.hessian, gap))
+        reach = -ndtri(tail) * np.sqrt(variance)
+        odds = (z / np.sqrt(1 + np.pi * variance / 8), z - reach, z + reach)
+        return Interval(*((0.5 * (1 + np.tanh(0.5 * part))).reshape(batch) for part in odds))
 
     def nearest_diagonal(self) -> MapResult:
         """Return the best diagonal (Q, R) for the same answers: a few numbers that can be read.
@@ -249,6 +287,35 @@ def fit_maps(
         many = f" ({len(bad)} of {len(results)} problems)" if len(results) > 1 else ""
         warnings.warn(f"fit_map: {bad[0].message}{many}", RuntimeWarning, stacklevel=2)
     return results
+
+
+def new_gaps(
+    result: MapResult, first: Any, second: Any, level: float
+) -> tuple[np.ndarray, tuple[int, ...], float]:
+    """Return the moment differences (p, n) of new pairs, their batch shape and (1 − level) / 2."""
+    if not 0 < level < 1:
+        raise ValueError(f"level must lie in (0, 1), got {level}")
+    instance("first", first, Trajectory)
+    instance("second", second, Trajectory)
+    shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(side)] for side in (first, second)]
+    trained = result.comparisons.trajectories
+    channels = [side.shape[-1] for side in (trained.x, trained.u)]
+    if shapes[0] != shapes[1] or [first.x.shape[-1], first.u.shape[-1]] != channels:
+        raise ValueError(
+            f"first and second must have equal shapes with {channels[0]} states and "
+            f"{channels[1]} inputs, got {shapes[0]} and {shapes[1]}"
+        )
+    batch = first.batch_shape
+    flat = [
+        jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(batch) :]), side)
+        for side in (first, second)
+    ]
+    n = len(flat[0])
+    both = jax.tree.map(lambda a, b: np.concatenate([a, b]), *flat)
+    pairs = Comparisons(both, np.arange(n), np.arange(n, 2 * n), np.full(n, 0.5))
+    problem = result.problem
+    gap = pair_gaps(pairs, problem.entries, problem.unit, result.outputs)
+    return gap, batch, (1 - level) / 2
 
 
 def split(W: np.ndarray, nq: int, outputs: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:

@@ -13,10 +13,8 @@ import numpy as np
 
 from prefmpc._chart import Chart, Laplace, laplaces, minus_log_posterior
 from prefmpc._checks import instance, positive_int, to_numpy
-from prefmpc._newton import pair_gaps
 from prefmpc._random import generator
-from prefmpc.comparisons import Comparisons
-from prefmpc.convex import MapResult, split
+from prefmpc.convex import Interval, MapResult, new_gaps, split
 from prefmpc.models import QuadraticCost
 from prefmpc.trajectories import Trajectory
 
@@ -32,14 +30,6 @@ LEAPFROGS = 32
 
 SMALLEST_SHARE = 0.1
 """Of the draws, that must be worth independent ones."""
-
-
-class Interval(NamedTuple):
-    """A posterior mean and the bounds of an interval about it, all of the same shape."""
-
-    mean: np.ndarray
-    lower: np.ndarray
-    upper: np.ndarray
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -113,30 +103,8 @@ class Posterior:
         Interval
             Three arrays (...). The mean is the probability to bet on.
         """
-        if not 0 < level < 1:
-            raise ValueError(f"level must lie in (0, 1), got {level}")
-        instance("first", first, Trajectory)
-        instance("second", second, Trajectory)
-        shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(side)] for side in (first, second)]
-        trained = self.result.comparisons.trajectories
-        channels = [side.shape[-1] for side in (trained.x, trained.u)]
-        if shapes[0] != shapes[1] or [first.x.shape[-1], first.u.shape[-1]] != channels:
-            raise ValueError(
-                f"first and second must have equal shapes with {channels[0]} states and "
-                f"{channels[1]} inputs, got {shapes[0]} and {shapes[1]}"
-            )
-        batch = first.batch_shape
-        flat = [
-            jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(batch) :]), side)
-            for side in (first, second)
-        ]
-        n = len(flat[0])
-        both = jax.tree.map(lambda a, b: np.concatenate([a, b]), *flat)
-        pairs = Comparisons(both, np.arange(n), np.arange(n, 2 * n), np.full(n, 0.5))
-        problem = self.result.problem
-        gap = pair_gaps(pairs, problem.entries, problem.unit, self.result.outputs)
+        gap, batch, tail = new_gaps(self.result, first, second, level)
         P = 0.5 * (1 + np.tanh(0.5 * (self.w @ gap)))
-        tail = (1 - level) / 2
         lower, upper = np.quantile(P, [tail, 1 - tail], axis=0)
         return Interval(*(part.reshape(batch) for part in (P.mean(axis=0), lower, upper)))
 

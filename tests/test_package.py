@@ -129,7 +129,10 @@ LAYERS = {
     },
     "selection": HELPERS | {"_newton", "_chart", "comparisons", "convex", "losses", "priors"},
     "global_fit": HELPERS | {"_newton", "comparisons", "models", "losses"},
-    "convex": HELPERS | {"_newton", "comparisons", "models", "losses", "priors"},
+    "convex": {
+        *HELPERS,
+        *("_newton", "trajectories", "comparisons", "models", "losses", "priors"),
+    },
     "mpc": HELPERS | {"systems", "sets", "trajectories", "models", "mpc"},
     "evaluation": {
         *HELPERS,
@@ -138,7 +141,8 @@ LAYERS = {
     "studies": {
         *HELPERS,
         *("systems", "sets", "trajectories", "pools", "preferences", "comparisons", "models"),
-        *("training", "mpc", "evaluation", "studies"),
+        *("training", "priors", "convex", "uncertainty", "selection", "global_fit"),
+        *("mpc", "evaluation", "studies"),
     },
     "plots": set(),
 }

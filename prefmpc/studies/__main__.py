@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from prefmpc.studies import measures, quadratic, settling
+from prefmpc.studies import measures, priors, quadratic, settling
 from prefmpc.studies.spread import write_spread
 
 BOOK = Path(__file__).parents[2] / "book"
@@ -56,6 +56,16 @@ STUDIES: dict[str, Study] = {
         _ties,
         "case_studies/ties_spread.json",
         {"rows": settling.TIES_ROWS, "columns": settling.TIES_COLUMNS},
+    ),
+    "priors": (
+        priors.priors_case,
+        "insight/priors_spread.json",
+        {"people": priors.PEOPLE, "sizes": quadratic.SIZES, "learners": priors.LEARNERS},
+    ),
+    "calibration": (
+        priors.calibration_case,
+        "insight/calibration_spread.json",
+        {"methods": priors.METHODS, "sizes": priors.ASKED, "levels": priors.LEVELS},
     ),
     "measures": (
         measures.measures_case,
