@@ -32,13 +32,13 @@ import prefmpc
 from prefmpc import studies
 prior = prefmpc.bryson(studies.RADIUS, [1, 1])
 pool = prefmpc.lqr_pool(
-    prefmpc.oscillating_masses(), 50, 10, key=jax.random.key(0), radius=studies.RADIUS
+    prefmpc.oscillating_masses(), POOL, 10, key=jax.random.key(0), radius=studies.RADIUS
 )
 person = prefmpc.QuadraticPreference(studies.QUADRATIC_Q, studies.QUADRATIC_R)
 """
 
 COLD = (
-    PREPARE
+    PREPARE.replace("POOL", "50")
     + """
 data = prefmpc.Comparisons.random(pool, person, 1000, key=jax.random.key(1))
 began = time.perf_counter()
@@ -48,15 +48,15 @@ print(time.perf_counter() - began)
 )
 
 MILLION = (
-    PREPARE
+    PREPARE.replace("POOL", "2000")
     + """
 import resource
 rng = np.random.default_rng(0)
 n = 1_000_000
-first = rng.integers(0, 50, n)
-second = (first + rng.integers(1, 50, n)) % 50
-wrong = rng.uniform(size=n) < 0.1
-labels = np.where(wrong, 1 - person(pool[first], pool[second]), person(pool[first], pool[second]))
+first = rng.integers(0, len(pool), n)
+second = (first + rng.integers(1, len(pool), n)) % len(pool)
+cost = prefmpc.phi(pool, studies.QUADRATIC_Q, studies.QUADRATIC_R)
+labels = (cost[first] <= cost[second]) ^ (rng.uniform(size=n) < 0.1)  # one in ten is wrong
 data = prefmpc.Comparisons(pool, first, second, labels)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 assert prefmpc.fit_map(data, prior).success

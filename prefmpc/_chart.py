@@ -11,7 +11,7 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 
 from prefmpc._checks import to_numpy
-from prefmpc._newton import Problem, loss, loss_and_slopes
+from prefmpc._newton import Problem, loss, loss_and_slopes, second_order
 
 
 class Chart(NamedTuple):
@@ -29,7 +29,7 @@ class Chart(NamedTuple):
     def of(cls, problem: Problem) -> Chart:
         """Return the chart of a problem; a ValueError if its zeros do not allow one."""
         entries, root = problem.entries, np.linalg.cholesky(problem.mode)
-        free = entries.place < entries.rows.size
+        free = entries.basis.any(axis=0)
         product = (root != 0).astype(int) @ np.tril(free).astype(int)
         if ((product @ product.T > 0) & ~free).any():
             raise ValueError(
@@ -110,7 +110,7 @@ def laplace(chart: Chart, w: Any, gap: Any, labels: Any, weights: Any, strength:
 
     def slopes(eta: Any) -> tuple[Any, Any]:
         _, slope, curvature = loss_and_slopes(chart.weights(eta) @ gap, labels, weights)
-        both = jnp.concatenate([gap * curvature, slope[None]]) @ gap.T
+        both = second_order(gap, slope, curvature)
 
         def rest(eta: Any) -> Any:  # what is left after the data's own curvature; p × p only
             return chart.weights(eta) @ both[-1] + chart.minus_log_prior(eta, strength)

@@ -11,10 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
 
-from prefmpc._checks import array_module, to_numpy
+from prefmpc._checks import to_numpy
 from prefmpc.comparisons import Comparisons
 from prefmpc.priors import WishartPrior
 from prefmpc.trajectories import Trajectory, second_moments
+
+BLOCK = 4096
+"""Comparisons that are worked on at a time; sizes above are padded to powers of two."""
 
 
 class Entries(NamedTuple):
@@ -22,25 +25,25 @@ class Entries(NamedTuple):
 
     rows: Any
     columns: Any
-    place: Any
-    """(d, d): which entry of w stands where in W; p, one past the end, for a zero."""
+    basis: Any
+    """(p, d, d): W = Σ_a w_a·basis_a."""
 
     @classmethod
     def of(cls, rows: np.ndarray, columns: np.ndarray) -> Entries:
-        """Number the entries."""
-        place = np.full((rows.max() + 1,) * 2, rows.size)
-        place[rows, columns] = place[columns, rows] = np.arange(rows.size)
-        return cls(rows, columns, place)
+        """Prepare the basis."""
+        basis = np.zeros((rows.size,) + (rows.max() + 1,) * 2)
+        number = np.arange(rows.size)
+        basis[number, rows, columns] = basis[number, columns, rows] = 1.0
+        return cls(rows, columns, basis)
 
     def matrix(self, w: Any) -> Any:
         """Return W (..., d, d) from w (..., p)."""
-        xp = array_module(w)
-        return xp.concatenate([w, xp.zeros_like(w[..., :1])], axis=-1)[..., self.place]
+        p, d = self.basis.shape[:2]
+        return (w @ self.basis.reshape(p, d * d)).reshape(*w.shape[:-1], d, d)
 
-    @property
-    def count(self) -> Any:
-        """How often each entry stands in W (p,): 1 on the diagonal, else 2."""
-        return jnp.where(self.rows == self.columns, 1.0, 2.0)
+    def gradient(self, M: Any) -> Any:
+        """Return the derivative (p,) of tr(M W) with respect to w, for a symmetric M (d, d)."""
+        return self.basis.reshape(len(self.rows), -1) @ M.reshape(-1)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -142,6 +145,28 @@ def loss_and_slopes(z: Any, labels: Any, weights: Any) -> tuple[Any, Any, Any]:
     return loss(z, labels, weights), weights * (p - labels), weights * p * (1 - p)
 
 
+def second_order(gap: Any, slope: Any, curvature: Any) -> Any:
+    """Return the data's Hessian gap·diag(curvature)·gapᵀ (p, p), and below it gap·slope.
+
+    One pass over the data; many comparisons go through the cache block by block.
+    """
+    p, size = gap.shape
+
+    def block(gap: Any, slope: Any, curvature: Any) -> Any:
+        return jnp.concatenate([gap * curvature, slope[None]]) @ gap.T
+
+    if size <= BLOCK:
+        return block(gap, slope, curvature)
+
+    def add(k: Any, total: Any) -> Any:
+        parts = [
+            jax.lax.dynamic_slice_in_dim(a, k * BLOCK, BLOCK, -1) for a in (gap, slope, curvature)
+        ]
+        return total + block(*parts)
+
+    return jax.lax.fori_loop(0, size // BLOCK, add, jnp.zeros((p + 1, p)))
+
+
 def loss(z: Any, labels: Any, weights: Any) -> Any:
     """Return Σ cross-entropy."""
     # log(1 + e) instead of log1p(e): below 1e-16 nothing is left in the sum anyway, and faster.
@@ -153,12 +178,14 @@ def product_hessian(A: Any, B: Any, entries: Entries) -> Any:
 
     With A = W⁻¹ and B = strength·W⁻¹ it is the Hessian of −strength·log det W.
     """
-    i, j = entries.rows, entries.columns
+    p = len(entries.rows)
+    left, right = entries.basis @ A, (entries.basis @ B).swapaxes(1, 2)
+    return left.reshape(p, -1) @ right.reshape(p, -1).T
 
-    def part(A: Any, B: Any) -> Any:
-        return A[i[:, None], i] * B[j[:, None], j] + A[i[:, None], j] * B[j[:, None], i]
 
-    return entries.count[:, None] * entries.count / 4 * (part(A, B) + part(B, A))
+def factor(M: Any) -> Any:
+    """Return the Cholesky factor, NaN if there is none."""
+    return jax.lax.linalg.cholesky(M, symmetrize_input=False)
 
 
 class Minimum(NamedTuple):
@@ -222,38 +249,25 @@ def newton(
     The calls to LAPACK depend on each other, one after the other: two that do not can wait for
     each other forever in a small thread pool.
     """
-    rows, columns, count = entries.rows, entries.columns, entries.count
     eye = jnp.eye(mode.shape[0])
 
     def invert(W: Any) -> Any:
-        root = solve_triangular(jnp.linalg.cholesky(W), eye, lower=True)
+        root = solve_triangular(factor(W), eye, lower=True)
         return root.T @ root
 
-    def packed(M: Any) -> Any:  # the derivative of tr(M W) with respect to w
-        return count * M[rows, columns]
-
-    precision = packed(invert(mode))
+    precision = entries.gradient(invert(mode))
 
     def objective(w: Any, z: Any, strength: Any, tightness: Any) -> Any:
         # NaN outside of the cone, where Cholesky fails.
-        L = jnp.linalg.cholesky(entries.matrix(w))
+        L = factor(entries.matrix(w))
         log_det = 2 * jnp.sum(jnp.log(jnp.diag(L)))
         return loss(z, labels, weights) + strength * (tightness * (precision @ w) - log_det)
 
     def solve_newton(hessian: Any, gradient: Any) -> tuple[Any, Any]:
         unit = 1 / jnp.sqrt(jnp.diag(hessian))
-        L = jnp.linalg.cholesky(hessian * unit * unit[:, None])
+        L = factor(hessian * unit * unit[:, None])
         half = solve_triangular(L, gradient * unit, lower=True)
         return -unit * solve_triangular(L, half, lower=True, trans=1), half @ half / 2
-
-    def longest(M: Any, dM: Any) -> Any:
-        """Return a step length that keeps M + t·dM inside of the cone."""
-
-        def outside(t: Any) -> Any:
-            trial = jnp.linalg.cholesky(M + t / TO_BOUNDARY * dM)
-            return ~jnp.isfinite(trial[-1, -1]) & (t > 1e-9)
-
-        return jax.lax.while_loop(outside, lambda t: 0.7 * t, 1.0)
 
     def unfinished(state: _State) -> Any:
         return (state.steps < limit) & ~small(state) & ~state.stuck
@@ -268,8 +282,8 @@ def newton(
         W = entries.matrix(w)
         inverse = invert(W)
         _, slope, curvature = loss_and_slopes(z, labels, weights)
-        both = jnp.concatenate([gap * curvature, slope[None]]) @ gap.T  # one pass over the data
-        gradient = both[-1] + strength * (tightness * precision - packed(inverse))
+        both = second_order(gap, slope, curvature)
+        gradient = both[-1] + strength * (tightness * precision - entries.gradient(inverse))
         # Near the end Z = strength·W⁻¹ up to rounding; then the exact Hessian is as good.
         last = arrived & (state.decrement <= ALMOST * (1 + jnp.abs(state.objective)))
         partner = jnp.where(last, strength * inverse, dual)
@@ -285,28 +299,37 @@ def newton(
             return ~(trial <= now - 0.05 * t * decrement + slack) & (t > 1e-12)
 
         def shorter(search: Any) -> Any:
-            t = search[0] / 2
-            return t, objective(w + t * step, z + t * dz, strength, tightness)
+            t = search[0] * 0.6
+            room = factor(W + t / TO_BOUNDARY * dW)[-1, -1]  # NaN if the boundary is too near
+            trial = objective(w + t * step, z + t * dz, strength, tightness)
+            return t, jnp.where(jnp.isnan(room), jnp.nan, trial)
 
         t: Any
-        t, trial = jax.lax.while_loop(refused, shorter, (2 * longest(W, dW), jnp.nan))
+        t, trial = jax.lax.while_loop(refused, shorter, (1 / 0.6, jnp.nan))
         turned = inverse @ dW @ dual
         change = strength * inverse - dual - (turned + turned.T) / 2
         t, change = jax.lax.optimization_barrier((t, change))  # LAPACK again: after the line search
-        dual = dual + longest(dual, change) * change
 
+        def outside(s: Any) -> Any:
+            return jnp.isnan(factor(dual + s / TO_BOUNDARY * change)[-1, -1]) & (s > 1e-9)
+
+        dual = dual + jax.lax.while_loop(outside, lambda s: 0.7 * s, 1.0) * change
         final = arrived & (decrement <= tol * (1 + jnp.abs(now)))
         certified = final & last
         stuck = ~certified & ~(t > 1e-12)
-        t = jnp.where(certified | stuck, 0.0, t)
+        t = jnp.where(stuck, 0.0, t)  # a certified point still takes the step that it has paid for
         near = decrement <= 3 * strength
-        factor = jnp.where(near, SHRINK, 1.0)
+
+        def nearer(now: Any, goal: Any) -> Any:
+            next_one = jnp.where(now < 2.5 * SHRINK * goal, goal, now / SHRINK)
+            return jnp.where(near, next_one, now)
+
         return _State(
             w + t * step,
             z + t * dz,
             dual,
-            jnp.maximum(wanted, strength / factor),
-            jnp.maximum(1.0, tightness / factor),
+            nearer(strength, wanted),
+            nearer(tightness, 1.0),
             jnp.where(t > 0, trial, now),
             # Only the exact Hessian at the end of the path certifies anything.
             jnp.where(arrived, jnp.where(last | ~final, decrement, ALMOST), jnp.inf),
@@ -315,14 +338,15 @@ def newton(
             stuck,
         )
 
-    w = mode[rows, columns]
+    w = mode[entries.rows, entries.columns]
     z = w @ gap
     size = jnp.sqrt(weights @ z**2 / jnp.maximum(jnp.sum(weights), 1.0))
     tightness = jnp.maximum(1.0, size / LOG_ODDS)
     w, z, inverse = w / tightness, z / tightness, invert(mode) * tightness
     _, slope, _ = loss_and_slopes(z, labels, weights)
-    _, decrement = solve_newton(product_hessian(inverse, inverse, entries), gap @ slope)
-    strength = jnp.maximum(wanted, jnp.sqrt(2 * decrement))
+    count = jnp.where(entries.rows == entries.columns, 1.0, 2.0)
+    pull = mode @ entries.matrix(gap @ slope / count) / tightness
+    strength = jnp.maximum(wanted, jnp.sqrt(jnp.abs(jnp.sum(pull * pull.T))))
     start = _State(
         w,
         z,

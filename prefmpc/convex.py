@@ -52,8 +52,8 @@ class MapResult:
     log_likelihood : float
         −Σ cross-entropy, in nats.
     decrement : float
-        λ²/2, half the squared Newton decrement where the solver stopped: to second order the
-        distance of ``objective`` from its minimum.
+        λ²/2, half the squared Newton decrement at the last but one point: to second order its
+        distance from the minimum. Another full step followed.
     iterations : int
     seconds : float
         Wall time, compilation included if there was one; of the whole call in `fit_maps`.
@@ -180,7 +180,7 @@ def fit_map(
     structure: Structure = "full",
     outputs: ArrayLike | None = None,
     max_iterations: int = 100,
-    tol: float = 1e-10,
+    tol: float = 1e-8,
 ) -> MapResult:
     """Return the maximum a posteriori weights of a quadratic σ: one start, no randomness.
 
@@ -235,7 +235,7 @@ def fit_maps(
     structure: Structure = "full",
     outputs: ArrayLike | None = None,
     max_iterations: int = 100,
-    tol: float = 1e-10,
+    tol: float = 1e-8,
 ) -> list[MapResult]:
     """Solve many problems of `fit_map` in one compiled call: many data sets, or many priors.
 
@@ -381,5 +381,5 @@ def _paired(
 def _status(minimum: Minimum, Q: np.ndarray, R: np.ndarray, tol: float) -> Status:
     if not (np.isfinite(Q).all() and np.isfinite(R).all() and np.isfinite(minimum.objective)):
         return "not_finite"
-    small = minimum.decrement <= tol * (1 + abs(minimum.objective))
+    small = minimum.decrement <= 1.01 * tol * (1 + abs(minimum.objective))
     return "converged" if small else "max_iterations"

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from prefmpc._checks import instance, nonnegative, require_x64, to_numpy
-from prefmpc._newton import Entries, loss, loss_and_slopes
+from prefmpc._newton import Entries, loss, loss_and_slopes, second_order
 from prefmpc.comparisons import Comparisons
 from prefmpc.losses import FitError, PairData, padded_size, pair_data
 from prefmpc.models import DIAGONAL_MIN, QuadraticCost
@@ -180,7 +180,7 @@ def _follow(
 
     def direction(w: Any, mu: Any) -> tuple[Any, Any]:
         _, slope, curvature = loss_and_slopes(w @ gap, labels, weights)
-        both = jnp.concatenate([gap * curvature, slope[None]]) @ gap.T
+        both = second_order(gap, slope, curvature)
         gradient = both[-1] + l2 * on_diagonal + mu * jax.grad(barrier)(w)
         hessian = both[:-1] + mu * jax.hessian(barrier)(w)
         unit = 1 / jnp.sqrt(jnp.diag(hessian))
