@@ -53,14 +53,17 @@ FORCE_MAX = np.array([1.0, 1.0])
 
 SCALES = (0.01, 0.1, 1.0, 10.0, 100.0)
 STRENGTHS = (0.1, 1.0, 10.0)
-CANDIDATES = tuple(
-    bryson(RADIUS, FORCE_MAX, scale=scale, strength=strength)
-    for scale in SCALES
-    for strength in STRENGTHS
-)
-
 _NEIGHBOURS = np.array([[1.0, -1, 0, 0, 0, 0], [0, 1, -1, 0, 0, 0]])
 COUPLED_Q = QUADRATIC_Q + 100.0 * _NEIGHBOURS.T @ _NEIGHBOURS
+
+
+def candidates() -> list[WishartPrior]:
+    """Return Bryson's prior with each of `SCALES` and `STRENGTHS`."""
+    return [
+        bryson(RADIUS, FORCE_MAX, scale=scale, strength=strength)
+        for scale in SCALES
+        for strength in STRENGTHS
+    ]
 
 
 def priors_case(
@@ -128,7 +131,7 @@ def _learn(data: Comparisons, test: Comparisons, rng: Any) -> tuple[list[Quadrat
     full = fit_maps(data, [nothing, rule])
     diagonal = fit_maps(data, [nothing, rule], structure="diagonal")
     choices = [
-        choose_prior(data, CANDIDATES, by=by, structure="diagonal")
+        choose_prior(data, candidates(), by=by, structure="diagonal")
         for by in ("evidence", "cross_validation")
     ]
     models = [
