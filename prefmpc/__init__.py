@@ -19,7 +19,14 @@ from prefmpc.evaluation import (
 from prefmpc.global_fit import GlobalResult, fit_global
 from prefmpc.losses import FitError
 from prefmpc.models import CostModel, QuadraticCost
-from prefmpc.mpc import BatchedMPC, LinearMPC, MPCError, MPCSolution
+from prefmpc.mpc import (
+    BatchedMPC,
+    LinearMPC,
+    MPCError,
+    MPCSolution,
+    TerminalIngredients,
+    terminal_ingredients,
+)
 from prefmpc.pools import lqr_pool, random_states, random_weights
 from prefmpc.preferences import (
     Criterion,
@@ -34,7 +41,7 @@ from prefmpc.preferences import (
 )
 from prefmpc.priors import WishartPrior, blocks, bryson
 from prefmpc.selection import PriorChoice, choose_prior
-from prefmpc.sets import Polyhedron
+from prefmpc.sets import Ellipsoid, Polyhedron
 from prefmpc.systems import LinearSystem, oscillating_masses
 from prefmpc.training import FitResult, fit
 from prefmpc.trajectories import (
@@ -57,6 +64,7 @@ __all__ = [
     "Comparisons",
     "CostModel",
     "Criterion",
+    "Ellipsoid",
     "FitError",
     "FitResult",
     "GlobalResult",
@@ -74,6 +82,7 @@ __all__ = [
     "QuadraticCost",
     "QuadraticPreference",
     "SettlingTimePreference",
+    "TerminalIngredients",
     "Trajectory",
     "WinRate",
     "WishartPrior",
@@ -104,5 +113,6 @@ __all__ = [
     "settling_text",
     "settling_time",
     "simulate",
+    "terminal_ingredients",
     "win_rate",
 ]

@@ -1,4 +1,4 @@
-"""Constraint sets: polyhedra over states, or over states and inputs together."""
+"""Constraint sets: polyhedra and ellipsoids."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import bounds_pair, finite_array
+from prefmpc._checks import bounds_pair, finite_array, psd_matrix
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
@@ -65,3 +65,45 @@ class Polyhedron:
         if z.shape[-1:] != (self.dim,):
             raise ValueError(f"z must have shape (..., {self.dim}), got {z.shape}")
         return np.asarray((z @ self.H.T <= self.h + tol).all(axis=-1))
+
+
+@dataclasses.dataclass(frozen=True, eq=False, init=False)
+class Ellipsoid:
+    """The set {z : zᵀ P z ≤ level}, about the origin.
+
+    Parameters
+    ----------
+    P : array (n, n)
+        Symmetric positive definite.
+    level : float
+        Positive; infinite for the whole space.
+
+    Raises
+    ------
+    ValueError
+        If P is not positive definite or ``level`` is not positive.
+    """
+
+    P: np.ndarray
+    level: float
+
+    def __init__(self, P: ArrayLike, level: float = 1.0) -> None:
+        matrix = psd_matrix("P", P, definite=True)
+        if matrix.ndim != 2:
+            raise ValueError(f"P must be one matrix, got shape {matrix.shape}")
+        if np.isnan(level) or not level > 0:
+            raise ValueError(f"level must be positive, got {level}")
+        object.__setattr__(self, "P", np.asarray(matrix))
+        object.__setattr__(self, "level", float(level))
+
+    @property
+    def dim(self) -> int:
+        """Number of entries of z."""
+        return len(self.P)
+
+    def contains(self, z: ArrayLike, tol: float = 1e-9) -> np.ndarray:
+        """Say for each z (..., n) whether zᵀPz ≤ level·(1 + tol); a bool array (...)."""
+        z = np.asarray(finite_array("z", z))
+        if z.shape[-1:] != (self.dim,):
+            raise ValueError(f"z must have shape (..., {self.dim}), got {z.shape}")
+        return np.asarray(np.einsum("...i,ij,...j", z, self.P, z) <= self.level * (1 + tol))

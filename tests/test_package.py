@@ -141,7 +141,7 @@ LAYERS = {
     "studies": {
         *HELPERS,
         *("systems", "sets", "trajectories", "pools", "preferences", "comparisons", "models"),
-        *("training", "priors", "convex", "uncertainty", "selection", "global_fit"),
+        *("training", "priors", "convex", "uncertainty", "selection"),
         *("mpc", "evaluation", "studies"),
     },
     "plots": set(),
@@ -182,6 +182,7 @@ MADE = {
         "Moments",
         "Posterior",
         "PriorChoice",
+        "TerminalIngredients",
         "WinRate",
     ),
 }

@@ -3,5 +3,13 @@
 from prefmpc.mpc.batched import BatchedMPC
 from prefmpc.mpc.qp import LinearMPC
 from prefmpc.mpc.solution import MPCError, MPCSolution
+from prefmpc.mpc.terminal import TerminalIngredients, terminal_ingredients
 
-__all__ = ["BatchedMPC", "LinearMPC", "MPCError", "MPCSolution"]
+__all__ = [
+    "BatchedMPC",
+    "LinearMPC",
+    "MPCError",
+    "MPCSolution",
+    "TerminalIngredients",
+    "terminal_ingredients",
+]

@@ -13,6 +13,7 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 from prefmpc._checks import instance, positive_int
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc.solution import MPCError, MPCSolution, check_problem, check_state
+from prefmpc.mpc.terminal import TerminalIngredients
 from prefmpc.sets import Polyhedron
 from prefmpc.systems import LinearSystem
 from prefmpc.trajectories import Trajectory
@@ -47,8 +48,9 @@ class LinearMPC:
         N ≥ 1.
     constraints : Polyhedron, optional
         Over the stacked (x_k, u_k), dimension nx + nu, for k = 0 … N−1.
-    terminal : Polyhedron, optional
-        Over x_N, dimension nx.
+    terminal : Polyhedron or TerminalIngredients, optional
+        X_N, of dimension nx; or the ingredients of `terminal_ingredients`: their polyhedron is
+        X_N, and x_NᵀPx_N is added to the cost.
 
     Raises
     ------
@@ -63,7 +65,7 @@ class LinearMPC:
         horizon: int,
         *,
         constraints: Polyhedron | None = None,
-        terminal: Polyhedron | None = None,
+        terminal: Polyhedron | TerminalIngredients | None = None,
     ) -> None:
         check_problem(system, cost)
         if cost.batch_shape:
@@ -74,6 +76,9 @@ class LinearMPC:
         self.system = system
         self.cost = cost
         self.horizon = positive_int("horizon", horizon)
+        final = np.zeros((system.nx, system.nx))
+        if isinstance(terminal, TerminalIngredients):
+            final, terminal = terminal.P, terminal.polyhedron
         for name, given, dim in (
             ("constraints", constraints, system.nx + system.nu),
             ("terminal", terminal, system.nx),
@@ -83,16 +88,20 @@ class LinearMPC:
             instance(name, given, Polyhedron)
             if given.dim != dim:
                 raise ValueError(f"{name} must have dimension {dim}, got {given.dim}")
-        self._build(constraints, terminal)
+        if final.shape != (system.nx, system.nx):
+            raise ValueError(f"terminal must have dimension {system.nx}, got {len(final)}")
+        self._build(constraints, terminal, final)
 
-    def _build(self, constraints: Polyhedron | None, terminal: Polyhedron | None) -> None:
+    def _build(
+        self, constraints: Polyhedron | None, terminal: Polyhedron | None, final: np.ndarray
+    ) -> None:
         import osqp
 
         system, N = self.system, self.horizon
         nx, nu = system.nx, system.nu
         # Decision vector: x_0 … x_N, then u_0 … u_{N−1}.
         states, inputs = nx * (N + 1), nu * N
-        weights = [sp.kron(sp.eye(N), 2 * np.asarray(self.cost.Q)), sp.csc_matrix((nx, nx))]
+        weights = [sp.kron(sp.eye(N), 2 * np.asarray(self.cost.Q)), sp.csc_matrix(2 * final)]
         P = sp.block_diag([*weights, sp.kron(sp.eye(N), 2 * np.asarray(self.cost.R))])
         dynamics = sp.kron(sp.eye(N + 1), -sp.eye(nx)) + sp.kron(sp.eye(N + 1, k=-1), system.A)
         forcing = sp.vstack([sp.csc_matrix((nx, inputs)), sp.kron(sp.eye(N), system.B)])

@@ -33,7 +33,7 @@ class MPCSolution:
     trajectory : Trajectory
         The predicted optimal trajectory T*, with ``horizon`` steps; NaN unless solved.
     cost : array (...)
-        σ(T*); NaN unless solved.
+        σ(T*), with the terminal cost if there is one; NaN unless solved.
     status : str, or array of str (...)
         "solved", "infeasible", "max_iterations" or "failed".
     message : str

@@ -10,7 +10,6 @@ from scipy.stats import wishart
 from prefmpc._random import generator
 from prefmpc.comparisons import Comparisons
 from prefmpc.convex import fit_map, fit_maps
-from prefmpc.global_fit import fit_global
 from prefmpc.models import QuadraticCost
 from prefmpc.pools import lqr_pool, random_states
 from prefmpc.preferences import QuadraticPreference, logistic
@@ -33,7 +32,6 @@ from prefmpc.uncertainty import posterior
 
 LEARNERS = (
     "recipe, best of 20",
-    "recipe's minimum",
     "knows nothing, full",
     "knows nothing, diagonal",
     "Bryson, full",
@@ -136,7 +134,6 @@ def _learn(data: Comparisons, test: Comparisons, rng: Any) -> tuple[list[Quadrat
     ]
     models = [
         fit(data, key=rng, selection="leaky_test_accuracy", test=test).model,
-        fit_global(data).model,
         full[0].model,
         diagonal[0].model,
         full[1].model,
