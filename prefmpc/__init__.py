@@ -18,15 +18,17 @@ from prefmpc.evaluation import (
 )
 from prefmpc.global_fit import GlobalResult, fit_global
 from prefmpc.losses import FitError
-from prefmpc.models import CostModel, QuadraticCost
+from prefmpc.models import CostModel, QuadraticCost, SumCost
 from prefmpc.mpc import (
     BatchedMPC,
+    ConvexMPC,
     LinearMPC,
     MPCError,
     MPCSolution,
     TerminalIngredients,
     terminal_ingredients,
 )
+from prefmpc.networks import ICNNCost
 from prefmpc.pools import lqr_pool, random_states, random_weights
 from prefmpc.preferences import (
     Criterion,
@@ -41,7 +43,7 @@ from prefmpc.preferences import (
 )
 from prefmpc.priors import WishartPrior, blocks, bryson
 from prefmpc.selection import PriorChoice, choose_prior
-from prefmpc.sets import Ellipsoid, Polyhedron
+from prefmpc.sets import Ellipsoid, Polyhedron, SecondOrderCone
 from prefmpc.systems import LinearSystem, oscillating_masses
 from prefmpc.training import FitResult, fit
 from prefmpc.trajectories import (
@@ -62,12 +64,14 @@ __all__ = [
     "BatchedMPC",
     "ClosedLoops",
     "Comparisons",
+    "ConvexMPC",
     "CostModel",
     "Criterion",
     "Ellipsoid",
     "FitError",
     "FitResult",
     "GlobalResult",
+    "ICNNCost",
     "Interval",
     "LinearMPC",
     "LinearSystem",
@@ -81,7 +85,9 @@ __all__ = [
     "PriorChoice",
     "QuadraticCost",
     "QuadraticPreference",
+    "SecondOrderCone",
     "SettlingTimePreference",
+    "SumCost",
     "TerminalIngredients",
     "Trajectory",
     "WinRate",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from functools import cache
 from typing import Any, Protocol, runtime_checkable
 
@@ -10,7 +11,14 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import array_module, instance, psd_matrix, require_x64, shaped
+from prefmpc._checks import (
+    array_module,
+    instance,
+    nonnegative,
+    psd_matrix,
+    require_x64,
+    shaped,
+)
 from prefmpc._pytree import bypass_init, check_index, register_pytree
 from prefmpc.pools import random_weights
 from prefmpc.trajectories import Trajectory, second_moments
@@ -162,6 +170,69 @@ class QuadraticCost:
 
 
 register_pytree(QuadraticCost)
+
+
+@dataclasses.dataclass(frozen=True, eq=False, init=False)
+class SumCost:
+    """A weighted sum of σ models: σ(T) = Σ_i weight_i·σ_i(T).
+
+    Trained with `fit`, all models learn together; the weights stay as they are.
+
+    Parameters
+    ----------
+    models : sequence of σ models
+        Single ones, or stacks with the same leading shape.
+    weights : sequence of float, optional
+        Nonnegative, so that a sum of convex models is convex. Default: ones.
+
+    Raises
+    ------
+    ValueError
+        If there is no model, one is not a σ model, or a weight is negative.
+    """
+
+    models: tuple[Any, ...]
+    weights: tuple[float, ...]
+
+    linear_in_features = False
+
+    def __init__(self, models: Sequence[Any], weights: Sequence[float] | None = None) -> None:
+        if isinstance(models, CostModel) or not len(models):
+            raise ValueError("models must be a sequence of at least one σ model")
+        for i, model in enumerate(models):
+            if not isinstance(model, CostModel):
+                raise ValueError(f"models[{i}] must be a σ model, got {type(model).__name__}")
+        factors = [1.0] * len(models) if weights is None else list(weights)
+        if len(factors) != len(models):
+            raise ValueError(f"weights must be {len(models)} numbers, got {len(factors)}")
+        values = tuple(nonnegative(f"weights[{i}]", w) for i, w in enumerate(factors))
+        object.__setattr__(self, "models", tuple(models))
+        object.__setattr__(self, "weights", values)
+
+    def __call__(self, trajectory: Trajectory) -> Any:
+        """Return σ(T) for every trajectory of a batch, shape (...)."""
+        parts = zip(self.weights, self.models, strict=True)
+        return sum(weight * model(trajectory) for weight, model in parts)
+
+    def features(self, trajectory: Trajectory) -> Any:
+        """Return the features of every model."""
+        return tuple(model.features(trajectory) for model in self.models)
+
+    def score(self, features: Any) -> Any:
+        """Return σ (...) from the features of every model."""
+        parts = zip(self.weights, self.models, features, strict=True)
+        return sum(weight * model.score(part) for weight, model, part in parts)
+
+    def bounds(self) -> tuple[SumCost, SumCost]:
+        """Return the bounds of all models as two sums."""
+        low, high = zip(*(model.bounds() for model in self.models), strict=True)
+        return (
+            bypass_init(SumCost, models=low, weights=self.weights),
+            bypass_init(SumCost, models=high, weights=self.weights),
+        )
+
+
+register_pytree(SumCost, static=("weights",))
 
 
 @cache

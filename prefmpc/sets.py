@@ -107,3 +107,54 @@ class Ellipsoid:
         if z.shape[-1:] != (self.dim,):
             raise ValueError(f"z must have shape (..., {self.dim}), got {z.shape}")
         return np.asarray(np.einsum("...i,ij,...j", z, self.P, z) <= self.level * (1 + tol))
+
+
+@dataclasses.dataclass(frozen=True, eq=False, init=False)
+class SecondOrderCone:
+    """The set {z : ‖F z + g‖₂ ≤ cᵀz + d}, for instance a limit on the length of a vector.
+
+    Parameters
+    ----------
+    F : array (m, n)
+    g : array (m,), optional
+    c : array (n,), optional
+        Default: zeros, which leaves ‖F z‖₂ ≤ d.
+    d : float
+
+    Raises
+    ------
+    ValueError
+        If something holds NaN or infinite values, or the shapes do not fit.
+    """
+
+    F: np.ndarray
+    g: np.ndarray
+    c: np.ndarray
+    d: float
+
+    def __init__(
+        self, F: ArrayLike, d: float, *, g: ArrayLike | None = None, c: ArrayLike | None = None
+    ) -> None:
+        matrix = np.asarray(finite_array("F", F, ndim=2))
+        m, n = matrix.shape
+        vectors = {"g": (g, m), "c": (c, n)}
+        object.__setattr__(self, "F", matrix)
+        for name, (value, size) in vectors.items():
+            vector = np.zeros(size) if value is None else np.asarray(finite_array(name, value))
+            if vector.shape != (size,):
+                raise ValueError(f"{name} must have shape ({size},), got {vector.shape}")
+            object.__setattr__(self, name, vector)
+        object.__setattr__(self, "d", float(finite_array("d", d, ndim=0)))
+
+    @property
+    def dim(self) -> int:
+        """Number of entries of z."""
+        return int(self.F.shape[1])
+
+    def contains(self, z: ArrayLike, tol: float = 1e-9) -> np.ndarray:
+        """Say for each z (..., n) whether ‖F z + g‖₂ ≤ cᵀz + d + tol; a bool array (...)."""
+        z = np.asarray(finite_array("z", z))
+        if z.shape[-1:] != (self.dim,):
+            raise ValueError(f"z must have shape (..., {self.dim}), got {z.shape}")
+        size = np.linalg.norm(z @ self.F.T + self.g, axis=-1)
+        return np.asarray(size <= z @ self.c + self.d + tol)

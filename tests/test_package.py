@@ -133,7 +133,8 @@ LAYERS = {
         *HELPERS,
         *("_newton", "trajectories", "comparisons", "models", "losses", "priors"),
     },
-    "mpc": HELPERS | {"systems", "sets", "trajectories", "models", "mpc"},
+    "networks": HELPERS | {"trajectories"},
+    "mpc": HELPERS | {"systems", "sets", "trajectories", "models", "networks", "mpc"},
     "evaluation": {
         *HELPERS,
         *("systems", "trajectories", "preferences", "comparisons", "models", "mpc"),

@@ -47,12 +47,12 @@ def test_the_stored_regrets_are_complete():
 
 def test_the_book_s_calibration_is_what_the_code_gives():
     assert len(CALIBRATION["covered"]) >= 200
-    assert CALIBRATION["covered"].shape[1:] == (2, len(ASKED), len(LEVELS))
+    assert CALIBRATION["covered"].shape[1:] == (2, 2, len(ASKED), len(LEVELS))
     again = calibration_case(key=jax.random.key(0))
     np.testing.assert_allclose(again["covered"], CALIBRATION["covered"][0], atol=0.1)
     np.testing.assert_allclose(again["width"], CALIBRATION["width"][0], atol=0.05)
     # Laplace's method has no samples, so nothing that a machine could round differently.
-    np.testing.assert_allclose(again["width"][1], CALIBRATION["width"][0, 1], rtol=1e-3)
+    np.testing.assert_allclose(again["width"][:, 1], CALIBRATION["width"][0, :, 1], rtol=1e-3)
 
 
 def test_people_answer_as_they_say():

@@ -192,7 +192,7 @@ class LinearMPC:
             cost = float(result.info.obj_val)
         return MPCSolution(
             u=inputs[0],
-            trajectory=_predicted(self.system, states, inputs),
+            trajectory=predicted(self.system, states, inputs),
             cost=cost,
             status=status,
             message=message,
@@ -202,7 +202,8 @@ class LinearMPC:
         )
 
 
-def _predicted(system: LinearSystem, states: np.ndarray, inputs: np.ndarray) -> Trajectory:
+def predicted(system: LinearSystem, states: np.ndarray, inputs: np.ndarray) -> Trajectory:
+    """Return a plan as a trajectory, NaN where the solve failed."""
     from prefmpc._pytree import bypass_init
 
     # Built without validation: the values of a failed solve are NaN on purpose.

@@ -65,7 +65,10 @@ STUDIES: dict[str, Study] = {
     "calibration": (
         priors.calibration_case,
         "insight/calibration_spread.json",
-        {"methods": priors.METHODS, "sizes": priors.ASKED, "levels": priors.LEVELS},
+        {
+            **{"cases": priors.CASES, "methods": priors.METHODS},
+            **{"sizes": priors.ASKED, "levels": priors.LEVELS},
+        },
     ),
     "measures": (
         measures.measures_case,

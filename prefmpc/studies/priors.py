@@ -9,11 +9,11 @@ from scipy.stats import wishart
 
 from prefmpc._random import generator
 from prefmpc.comparisons import Comparisons
-from prefmpc.convex import fit_map, fit_maps
+from prefmpc.convex import MapResult, fit_map, fit_maps
 from prefmpc.models import QuadraticCost
 from prefmpc.pools import lqr_pool, random_states
-from prefmpc.preferences import QuadraticPreference, logistic
-from prefmpc.priors import WishartPrior, bryson
+from prefmpc.preferences import Preference, QuadraticPreference, logistic
+from prefmpc.priors import Structure, WishartPrior, bryson
 from prefmpc.selection import choose_prior
 from prefmpc.studies.measures import unsure_scale
 from prefmpc.studies.quadratic import (
@@ -27,8 +27,8 @@ from prefmpc.studies.quadratic import (
 )
 from prefmpc.systems import oscillating_masses
 from prefmpc.training import fit
-from prefmpc.trajectories import phi
-from prefmpc.uncertainty import posterior
+from prefmpc.trajectories import Trajectory, phi
+from prefmpc.uncertainty import Posterior, posterior
 
 LEARNERS = (
     "recipe, best of 20",
@@ -145,47 +145,63 @@ def _learn(data: Comparisons, test: Comparisons, rng: Any) -> tuple[list[Quadrat
 
 
 LEVELS = (0.5, 0.8, 0.9, 0.95)
-ASKED = (20, 60)
+ASKED = (20, 100)
 METHODS = ("samples", "Laplace")
 PERSON_SCALE = 1e-3
 """Of the prior that people are drawn from: small, so that they often cannot say."""
 
 
-def calibration_case(*, key: Any, pairs: int = 50) -> dict[str, np.ndarray]:
-    """Draw somebody from a prior, ask, and compare what is then believed with what is true.
+CASES = ("drawn from the prior", "the person of case study 1")
 
-    The person's weights are drawn from Bryson's prior with scale `PERSON_SCALE`, and the answers
-    from the logistic model. For new pairs, P(first is preferred) is known; is it in the interval?
+
+def calibration_case(*, key: Any, pairs: int = 50) -> dict[str, np.ndarray]:
+    """Ask two people, and compare what is then believed with what is true.
+
+    The first is drawn from the prior that is used: Bryson's with scale `PERSON_SCALE`. The second
+    has the weights of case study 1 and noise 2, and is believed to be like Bryson's rule,
+    with diagonal weights, which is far off. Both answer by the logistic model. For new pairs,
+    P(first is preferred) is known; is it in the interval?
 
     Returns
     -------
     dict
-        "covered" (methods, sizes, levels): share of the new pairs whose probability lies in the
-        interval; "width" likewise: mean width of the intervals; "effective" (sizes,): independent
-        draws that the samples are worth. By `METHODS`, `ASKED` and `LEVELS`.
+        "covered" (cases, methods, sizes, levels): share of the new pairs whose probability lies
+        in the interval; "width" likewise: mean width of the intervals; "effective" (cases,
+        sizes): independent draws that the samples are worth. By `CASES`, `METHODS`, `ASKED` and
+        `LEVELS`. The second case has only pairs with a probability between 5 and 95 %.
     """
-    streams = generator(key).spawn(5)
+    streams = generator(key).spawn(6)
     prior = bryson(RADIUS, FORCE_MAX, scale=PERSON_SCALE)
-    person = QuadraticCost(
-        *(_draw(mode, prior.strength, streams[0]) for mode in (prior.Q, prior.R))
-    )
+    weights = [_draw(mode, prior.strength, streams[0]) for mode in (prior.Q, prior.R)]
     system = oscillating_masses()
     pool, fresh = (lqr_pool(system, 50, 10, key=k, radius=RADIUS) for k in streams[1:3])
-    ask = logistic(person, 1.0)
-    new = Comparisons.random(fresh, ask, pairs, key=streams[3])
+    drawn = logistic(QuadraticCost(*weights), 1.0)
+    new = Comparisons.random(fresh, drawn, pairs, key=streams[3])
+    first = _coverage(drawn, prior, "full", pool, new, streams[4])
+
+    known = logistic(QuadraticCost(QUADRATIC_Q, QUADRATIC_R), 2.0)
+    many = Comparisons.random(fresh, known, 20 * pairs, key=streams[5])
+    open_ones = np.flatnonzero((many.labels > 0.05) & (many.labels < 0.95))[:pairs]
+    rule = bryson(RADIUS, FORCE_MAX)
+    second = _coverage(known, rule, "diagonal", pool, many.subset(open_ones), streams[5])
+    return {name: np.stack([first[name], second[name]]) for name in first}
+
+
+def _coverage(
+    ask: Preference, prior: WishartPrior, structure: Structure, pool: Trajectory, new: Any, rng: Any
+) -> dict[str, np.ndarray]:
     shape = (len(METHODS), len(ASKED), len(LEVELS))
     covered, width, effective = np.zeros(shape), np.zeros(shape), np.zeros(len(ASKED))
-    for j, (n, rng) in enumerate(zip(ASKED, streams[4].spawn(len(ASKED)), strict=True)):
-        answers = Comparisons.random(pool, ask, n, key=rng).sampled(key=rng)
-        result = fit_map(answers, prior)
+    for j, (n, stream) in enumerate(zip(ASKED, rng.spawn(len(ASKED)), strict=True)):
+        answers = Comparisons.random(pool, ask, n, key=stream).sampled(key=stream)
+        result = fit_map(answers, prior, structure=structure)
         draws = posterior(result)
         effective[j] = draws.effective
         for k, level in enumerate(LEVELS):
-            intervals = (
-                draws.probability(*new.pairs, level),
-                result.probability(*new.pairs, level),
-            )
-            for i, (_, low, high) in enumerate(intervals):
+            beliefs: tuple[Posterior | MapResult, ...] = (draws, result)
+            for i, belief in enumerate(beliefs):
+                one, other = new.pairs
+                _, low, high = belief.probability(one, other, level)
                 covered[i, j, k] = np.mean((low <= new.labels) & (new.labels <= high))
                 width[i, j, k] = np.mean(high - low)
     return {"covered": covered, "width": width, "effective": effective}

@@ -1,0 +1,261 @@
+"""σ models that are networks."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from prefmpc._checks import (
+    finite_array,
+    instance,
+    nonnegative,
+    positive_int,
+    require_x64,
+    shaped,
+)
+from prefmpc._pytree import bypass_init, check_index, register_pytree
+from prefmpc._random import generator
+from prefmpc.trajectories import Trajectory
+
+Activation = Literal["softplus", "relu"]
+Over = Literal["stage", "trajectory"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, init=False)
+class ICNNCost:
+    """An input-convex network as σ: a convex function of the trajectory, whatever its weights.
+
+    With v = (x_k, u_k) / scale, summed over the stages k = 0 … N−1 (``over="stage"``), or
+    v = (x_0 … x_{N−1}, u_0 … u_{N−1}) / scale (``over="trajectory"``):
+
+        z_1 = g(V_1 v + b_1),  z_{i+1} = g(U_i z_i + V_{i+1} v + b_{i+1}),
+        σ = c·z_L + floor·‖v‖²
+
+    with a convex nondecreasing g and nonnegative U_i, c (Amos, Xu and Kolter, 2017). A sum of
+    convex functions with nonnegative weights is convex, and so is g of it.
+
+    Build one with `random`; train it with `fit`, whose bounds keep it convex.
+
+    Parameters
+    ----------
+    V : sequence of arrays (..., width_i, n_v)
+    b : sequence of arrays (..., width_i)
+    U : sequence of arrays (..., width_{i+1}, width_i)
+        Nonnegative.
+    c : array (..., width_L)
+        Nonnegative.
+    scale : array (n_x + n_u,)
+        Positive; the size of each signal, so that v is of order one.
+    activation : {"softplus", "relu"}
+    floor : float
+        Nonnegative. Positive: σ is strictly convex.
+    over : {"stage", "trajectory"}
+
+    Raises
+    ------
+    ValueError
+        If a shape does not fit, or a weight that must not be negative is.
+    """
+
+    V: tuple[Any, ...]
+    b: tuple[Any, ...]
+    U: tuple[Any, ...]
+    c: Any
+    scale: tuple[float, ...]
+    activation: Activation
+    floor: float
+    over: Over
+
+    linear_in_features = False
+
+    def __init__(
+        self,
+        V: Sequence[ArrayLike],
+        b: Sequence[ArrayLike],
+        U: Sequence[ArrayLike],
+        c: ArrayLike,
+        *,
+        scale: ArrayLike,
+        activation: Activation = "softplus",
+        floor: float = 0.0,
+        over: Over = "stage",
+    ) -> None:
+        if activation not in ("softplus", "relu"):
+            raise ValueError(f'activation must be "softplus" or "relu", got {activation!r}')
+        if over not in ("stage", "trajectory"):
+            raise ValueError(f'over must be "stage" or "trajectory", got {over!r}')
+        size = np.asarray(finite_array("scale", scale, ndim=1))
+        if size.size == 0 or (size <= 0).any():
+            raise ValueError(f"scale must hold positive numbers, got {size}")
+        if not len(V) == len(b) == len(U) + 1 >= 1:
+            raise ValueError(
+                "V, b and U must hold L, L and L − 1 layers with L ≥ 1, "
+                f"got {len(V)}, {len(b)} and {len(U)}"
+            )
+        layers = {
+            "V": [np.asarray(finite_array(f"V[{i}]", a)) for i, a in enumerate(V)],
+            "b": [np.asarray(finite_array(f"b[{i}]", a)) for i, a in enumerate(b)],
+            "U": [np.asarray(finite_array(f"U[{i}]", a)) for i, a in enumerate(U)],
+            "c": [np.asarray(finite_array("c", c))],
+        }
+        widths = [layer.shape[-1] if layer.ndim else 0 for layer in layers["b"]]
+        lead, n_v = layers["c"][0].shape[:-1], layers["V"][0].shape[-1]
+        wanted: dict[str, list[tuple[int, ...]]] = {
+            "V": [(width, n_v) for width in widths],
+            "b": [(width,) for width in widths],
+            "U": [(after, before) for before, after in itertools.pairwise(widths)],
+            "c": [(widths[-1],)],
+        }
+        for name, arrays in layers.items():
+            for i, (array, shape) in enumerate(zip(arrays, wanted[name], strict=True)):
+                label = name if name == "c" else f"{name}[{i}]"
+                if array.shape != (*lead, *shape):
+                    raise ValueError(
+                        f"{label} must have shape {(*lead, *shape)}, got {array.shape}"
+                    )
+                if name in "Uc" and (array < 0).any():
+                    raise ValueError(
+                        f"{label} must not be negative, else σ is not convex; got {array.min():.3g}"
+                    )
+        if (n_v != size.size) if over == "stage" else (n_v % size.size or n_v == 0):
+            raise ValueError(
+                f"V must have {'a multiple of ' if over == 'trajectory' else ''}{size.size} "
+                f"columns, the entries of v, got {n_v}"
+            )
+        values: dict[str, Any] = {
+            "V": tuple(layers["V"]),
+            "b": tuple(layers["b"]),
+            "U": tuple(layers["U"]),
+            "c": layers["c"][0],
+            "scale": tuple(float(s) for s in size),
+            "activation": activation,
+            "floor": nonnegative("floor", floor),
+            "over": over,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading shape of a stack of models; () for one."""
+        return tuple(self.c.shape[:-1])
+
+    def __getitem__(self, index: Any) -> ICNNCost:
+        """Index the leading dimensions of a stack of models."""
+        if not self.batch_shape:
+            raise IndexError("a single ICNNCost has no batch dimension to index")
+        check_index(index, self.batch_shape[0])
+        return jax.tree.map(lambda leaf: leaf[index], self)
+
+    def __call__(self, trajectory: Trajectory) -> Any:
+        """Return σ(T) for every trajectory of a batch, shape (...). For a single model."""
+        instance("trajectory", trajectory, Trajectory)
+        if self.batch_shape:
+            raise ValueError(f"the model must be a single one, got a stack {self.batch_shape}")
+        nx, nu = trajectory.x.shape[-1], trajectory.u.shape[-1]
+        if nx + nu != len(self.scale):
+            raise ValueError(
+                f"trajectory must have {len(self.scale)} states and inputs, got {nx} and {nu}"
+            )
+        features = self.features(trajectory)
+        if self.over == "trajectory":
+            n_v = self.V[0].shape[-1]
+            steps = n_v // len(self.scale)
+            shaped("trajectory.u", trajectory.u, (steps, nu), "as many steps as the model has")
+        return (
+            np.asarray(_score(self, features)) if _plain(features, self) else self.score(features)
+        )
+
+    @staticmethod
+    def features(trajectory: Trajectory) -> Any:
+        """Return the stages (x_k, u_k), shape (..., N, nx + nu)."""
+        xp = np if _plain(trajectory) else jnp
+        return xp.concatenate([trajectory.x[..., :-1, :], trajectory.u], axis=-1)
+
+    def score(self, features: Any) -> Any:
+        """Return σ (...) from stages (..., N, nx + nu)."""
+        v = features / np.asarray(self.scale)
+        if self.over == "trajectory":
+            return self._network(v.reshape(*v.shape[:-2], -1))
+        return self._network(v).sum(-1)
+
+    def _network(self, v: Any) -> Any:
+        act = jax.nn.relu if self.activation == "relu" else jax.nn.softplus
+        z = act(v @ self.V[0].T + self.b[0])
+        for V, b, U in zip(self.V[1:], self.b[1:], self.U, strict=True):
+            z = act(z @ U.T + v @ V.T + b)
+        return z @ self.c + self.floor * (v * v).sum(-1)
+
+    def bounds(self) -> tuple[ICNNCost, ICNNCost]:
+        """Return the bounds that keep σ convex as two models: U ≥ 0 and c ≥ 0."""
+        low = jax.tree.map(lambda leaf: np.full(leaf.shape, -np.inf), self)
+        zero = {
+            "U": tuple(np.zeros(leaf.shape) for leaf in self.U),
+            "c": np.zeros(self.c.shape),
+        }
+        low = bypass_init(ICNNCost, **{**_fields(low), **zero})
+        return low, jax.tree.map(lambda leaf: np.full(leaf.shape, np.inf), self)
+
+    @classmethod
+    def random(
+        cls,
+        scale: ArrayLike,
+        *,
+        key: Any,
+        widths: Sequence[int] = (16, 16),
+        steps: int | None = None,
+        shape: tuple[int, ...] = (),
+        activation: Activation = "softplus",
+        floor: float = 0.0,
+    ) -> ICNNCost:
+        """Draw a stack of networks to start training from.
+
+        Parameters
+        ----------
+        scale : array (n_x + n_u,)
+            The size of each state and input.
+        widths : sequence of int
+            Units of each hidden layer.
+        steps : int, optional
+            The network then looks at whole trajectories of so many steps, instead of stages.
+        shape : leading shape of the stack.
+        """
+        require_x64()
+        size = np.asarray(finite_array("scale", scale, ndim=1))
+        sizes = [positive_int(f"widths[{i}]", width) for i, width in enumerate(widths)]
+        if not sizes:
+            raise ValueError("widths must name at least one layer, got none")
+        n_v = size.size if steps is None else size.size * positive_int("steps", steps)
+        rng = generator(key)
+        V = [rng.standard_normal((*shape, width, n_v)) / np.sqrt(n_v) for width in sizes]
+        b = [0.1 * rng.standard_normal((*shape, width)) for width in sizes]
+        U = [
+            rng.uniform(0, 2 / before, (*shape, after, before))
+            for before, after in itertools.pairwise(sizes)
+        ]
+        c = rng.uniform(0, 2 / sizes[-1], (*shape, sizes[-1]))
+        over: Over = "stage" if steps is None else "trajectory"
+        return cls(V, b, U, c, scale=size, activation=activation, floor=floor, over=over)
+
+
+register_pytree(ICNNCost, static=("scale", "activation", "floor", "over"))
+
+
+def _fields(model: ICNNCost) -> dict[str, Any]:
+    return {field.name: getattr(model, field.name) for field in dataclasses.fields(model)}
+
+
+def _plain(*trees: Any) -> bool:
+    return all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(trees))
+
+
+@jax.jit
+def _score(model: ICNNCost, features: Any) -> Any:
+    return model.score(features)
