@@ -11,7 +11,7 @@ from prefmpc import Comparisons, FitError, QuadraticCost, fit_global
 from prefmpc.losses import objective, pair_data
 from prefmpc.studies import quadratic_data, settling_data
 
-STARTS = QuadraticCost.random(6, 2, key=jax.random.key(2300), shape=(3,))
+STARTS = QuadraticCost.random(6, 2, key=jax.random.key(2300), shape=(2,))
 TREE = jax.tree.structure(STARTS[0])
 LOW = STARTS[0].bounds()[0].theta
 
@@ -44,13 +44,13 @@ def answers(case: int, seed: int) -> Comparisons:
 
 @pytest.mark.parametrize("case", [1, 2])
 def test_every_start_in_theta_finds_the_same_minimum(case):
-    for seed in (2301, 2302, 2303):
+    for seed in (2301, 2302):
         data = answers(case, seed)
         result = fit_global(data)
         assert result.success, result.message
         assert result.gap <= 1e-8 * result.objective
         padded = pair_data(STARTS[0], data)
-        found = np.array([scipy_from(STARTS[m], padded) for m in range(3)])
+        found = np.array([scipy_from(STARTS[m], padded) for m in range(2)])
         np.testing.assert_allclose(found, result.objective, rtol=1e-6)
         # What is returned has this value, and lies within the bounds.
         model = QuadraticCost(result.Q, result.R)

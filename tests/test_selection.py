@@ -30,11 +30,11 @@ PRIORS = [
 
 
 def test_cross_validation_scores_are_those_of_fits_on_the_other_folds():
-    chosen = choose_prior(ANSWERS, PRIORS[1:4], by="cross_validation", folds=3)
-    for score, prior in zip(chosen.scores, PRIORS[1:4], strict=True):
+    chosen = choose_prior(ANSWERS, PRIORS, by="cross_validation")
+    for score, prior in list(zip(chosen.scores, PRIORS, strict=True))[1:4]:
         total = 0.0
-        for k in range(3):
-            out = np.arange(60) % 3 == k
+        for k in range(5):
+            out = np.arange(60) % 5 == k
             model = fit_map(ANSWERS.subset(~out), prior).model
             held = ANSWERS.subset(out)
             first, second = held.pairs
@@ -42,7 +42,7 @@ def test_cross_validation_scores_are_those_of_fits_on_the_other_folds():
             total += np.sum(held.labels * z - np.logaddexp(0, z))
         assert score == pytest.approx(total / 60, rel=1e-5)
     assert chosen.chosen == np.argmax(chosen.scores)
-    assert chosen.prior is PRIORS[1:4][chosen.chosen]
+    assert chosen.prior is PRIORS[chosen.chosen]
     np.testing.assert_allclose(chosen.result.Q, fit_map(ANSWERS, chosen.prior).Q, rtol=1e-8)
 
 

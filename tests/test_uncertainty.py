@@ -72,20 +72,20 @@ def test_one_weight_agrees_with_quadrature(strength):
     total = quad(density, 0, np.inf)[0]
     mean = quad(lambda q: q * density(q), 0, np.inf)[0] / total
     second = quad(lambda q: q**2 * density(q), 0, np.inf)[0] / total
-    draws = posterior(fit_map(data, prior), draws=4096)
+    draws = posterior(fit_map(data, prior))
     assert draws.success, draws.message
     std = np.sqrt(second - mean**2)
-    assert draws.Q.mean() == pytest.approx(mean, abs=0.1 * std)
-    assert draws.std_Q[0, 0] == pytest.approx(std, rel=0.1)
+    assert draws.Q.mean() == pytest.approx(mean, abs=0.15 * std)
+    assert draws.std_Q[0, 0] == pytest.approx(std, rel=0.15)
     below = quad(density, 0, mean)[0] / total
-    assert np.mean(draws.Q < mean) == pytest.approx(below, abs=0.04)
+    assert np.mean(draws.Q < mean) == pytest.approx(below, abs=0.06)
     evidence = choose_prior(data, [prior]).scores[0]
     assert evidence == pytest.approx(np.log(total), abs=0.2)  # Laplace's error
 
 
 @pytest.mark.parametrize("prior", [PRIOR, COUPLED], ids=["bryson", "coupled"])
 def test_without_answers_the_samples_are_the_wishart_prior(prior):
-    draws = posterior(fit_map(NOTHING, prior), draws=4096)
+    draws = posterior(fit_map(NOTHING, prior))
     assert draws.success, draws.message
     for samples, mode in ((draws.Q, prior.Q), (draws.R, prior.R)):
         d = len(mode)
@@ -146,14 +146,17 @@ def test_samples_are_definite_repeatable_and_independent_of_the_key():
     error = np.sqrt(1 / draws.effective + 1 / other.effective) * draws.std_Q
     assert (np.abs(draws.Q.mean(0) - other.Q.mean(0)) < 5 * error).all()
     assert (draws.Q != other.Q).any()
-    assert posterior(RESULT, draws=33).Q.shape[0] == 256
 
 
 def test_probabilities_are_those_of_the_samples():
-    draws = posterior(RESULT, draws=256)
+    draws = posterior(RESULT)
     first, second = POOL[:6], POOL[6:12]
-    models = draws.models
-    costs = [np.stack([models[i](side) for i in range(256)]) for side in (first, second)]
+    Q, R = draws.Q, draws.R
+    costs = [
+        np.einsum("tki,mij,tkj->mt", side.x[:, :-1], Q, side.x[:, :-1])
+        + np.einsum("tki,mij,tkj->mt", side.u, R, side.u)
+        for side in (first, second)
+    ]
     P = 1 / (1 + np.exp(costs[0] - costs[1]))
     mean, lower, upper = draws.probability(first, second, level=0.8)
     np.testing.assert_allclose(mean, P.mean(axis=0), rtol=1e-9)
@@ -164,27 +167,26 @@ def test_probabilities_are_those_of_the_samples():
     assert one.lower == pytest.approx(lower[0])
 
 
-def test_structures_and_outputs_have_posteriors_too():
-    structure = blocks([[0, 3], [1, 4], [2, 5]], [[0], [1]])
-    draws = posterior(fit_map(ANSWERS, PRIOR, structure=structure), draws=256)
-    assert draws.success, draws.message
-    assert draws.Q[:, 0, 3].std() > 0 == np.abs(draws.Q[:, 0, 1]).max()
+def test_blocks_of_outputs_have_posteriors_too():
     C = oscillating_masses().C
     prior = bryson([0.3, 0.3, 0.3], [1, 1], scale=1e-3)
-    draws = posterior(fit_map(ANSWERS, prior, outputs=C), draws=256)
+    structure = blocks([[0, 1], [2]], [[0], [1]])
+    draws = posterior(fit_map(ANSWERS, prior, structure=structure, outputs=C))
+    assert draws.success, draws.message
     assert np.linalg.matrix_rank(draws.Q[0]) == 3
-    assert np.abs(draws.Q[:, 3:]).max() == 0
+    assert np.abs(draws.Q[:, 3:]).max() == 0 < draws.Q[:, 0, 1].std()
+    assert np.abs(draws.Q[:, 2, :2]).max() == 0
     mean = draws.probability(POOL[:3], POOL[3:6]).mean
-    costs = draws.models
-    P = [1 / (1 + np.exp(costs[i](POOL[:3]) - costs[i](POOL[3:6]))) for i in range(256)]
-    np.testing.assert_allclose(mean, np.mean(P, axis=0), rtol=1e-9)
+    models = draws.models
+    P = [1 / (1 + np.exp(models[i](POOL[:3]) - models[i](POOL[3:6]))) for i in range(0, 1024, 8)]
+    np.testing.assert_allclose(mean, np.mean(P, axis=0), atol=0.1)
 
 
 def test_a_tridiagonal_structure_keeps_its_zeros_and_a_filled_one_is_refused():
     chain = np.abs(np.subtract.outer(np.arange(6), np.arange(6))) <= 1
     full = np.ones((2, 2), bool)
     result = fit_map(ANSWERS, PRIOR, structure=(chain, full))
-    draws = posterior(result, draws=256)
+    draws = posterior(result)
     assert np.abs(draws.Q[:, ~chain]).max() == 0
     ring = chain.copy()
     ring[0, 5] = ring[5, 0] = True
@@ -234,15 +236,15 @@ UNFINISHED = dataclasses.replace(RESULT, status="max_iterations")
         (lambda: posterior(ANSWERS), "result must be a MapResult, got Comparisons"),
         (lambda: posterior(RESULT, draws=0), "draws must be a whole number"),
         (
-            lambda: posterior(RESULT, draws=256).probability(POOL[:2], POOL[:2], level=1),
+            lambda: posterior(RESULT).probability(POOL[:2], POOL[:2], level=1),
             "level must lie in .0, 1., got 1",
         ),
         (
-            lambda: posterior(RESULT, draws=256).probability(POOL[:2], POOL[:3]),
+            lambda: posterior(RESULT).probability(POOL[:2], POOL[:3]),
             "first and second must have equal shapes",
         ),
         (
-            lambda: posterior(RESULT, draws=256).probability(POOL[:2], ANSWERS),
+            lambda: posterior(RESULT).probability(POOL[:2], ANSWERS),
             "second must be a Trajectory, got Comparisons",
         ),
     ],
