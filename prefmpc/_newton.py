@@ -198,6 +198,10 @@ class Minimum(NamedTuple):
     hessian: Any
     steps: Any
 
+    def converged(self, tol: float) -> bool:
+        """Whether the decrement certifies the minimum; the last step may have moved the value."""
+        return bool(self.decrement <= 1.01 * tol * (1 + abs(self.objective)))
+
 
 TO_BOUNDARY = 0.95
 """No step goes further towards a singular matrix than this share of the way."""
@@ -376,8 +380,9 @@ def solve(problems: Sequence[Problem], tol: float, limit: int) -> list[Minimum]:
     first = problems[0]
     if len(problems) == 1:
         p = first
-        one = _one(p.gap, p.labels, p.weights, p.entries, p.mode, p.strength, tol, limit)
-        return [to_numpy(one)]
+        return [
+            to_numpy(_one(p.gap, p.labels, p.weights, p.entries, p.mode, p.strength, tol, limit))
+        ]
     stack = {
         name: np.stack([getattr(p, name) for p in problems])
         for name in ("labels", "weights", "mode", "strength")

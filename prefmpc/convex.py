@@ -111,7 +111,8 @@ class MapResult:
     @property
     def normalised(self) -> QuadraticCost:
         """σ / `sharpness`: what is wanted, whatever the noise, so that people can be compared."""
-        return QuadraticCost(self.Q / self.sharpness, self.R / self.sharpness)
+        sharpness = self.sharpness
+        return QuadraticCost(self.Q / sharpness, self.R / sharpness)
 
     @property
     def std_Q(self) -> np.ndarray:
@@ -213,19 +214,9 @@ def fit_map(
     """
     instance("comparisons", comparisons, Comparisons)
     instance("prior", prior, WishartPrior)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        result = fit_maps(
-            comparisons,
-            prior,
-            structure=structure,
-            outputs=outputs,
-            max_iterations=max_iterations,
-            tol=tol,
-        )[0]
-    if not result.success:
-        warnings.warn(f"fit_map: {result.message}", RuntimeWarning, stacklevel=2)
-    return result
+    results = _solved([comparisons], [prior], structure, outputs, max_iterations, tol)
+    _warn_of_failures(results)
+    return results[0]
 
 
 def fit_maps(
@@ -249,14 +240,27 @@ def fit_maps(
     -------
     list of MapResult
     """
+    data_sets, beliefs = _paired(comparisons, priors)
+    results = _solved(data_sets, beliefs, structure, outputs, max_iterations, tol)
+    _warn_of_failures(results)
+    return results
+
+
+def _solved(
+    data_sets: list[Comparisons],
+    beliefs: list[WishartPrior],
+    structure: Structure,
+    outputs: ArrayLike | None,
+    max_iterations: int,
+    tol: float,
+) -> list[MapResult]:
     require_x64()
     began = time.perf_counter()
     limit, tol = positive_int("max_iterations", max_iterations), nonnegative("tol", tol)
-    data_sets, beliefs = _paired(comparisons, priors)
     C, entries = check(data_sets, beliefs, structure, outputs)
     size = padded_size(max(len(data) for data in data_sets))
-    if isinstance(comparisons, Comparisons):
-        problems = build(comparisons, beliefs, entries, C, size)
+    if all(data is data_sets[0] for data in data_sets):
+        problems = build(data_sets[0], beliefs, entries, C, size)
     else:
         pairs = zip(data_sets, beliefs, strict=True)
         problems = [build(data, [prior], entries, C, size)[0] for data, prior in pairs]
@@ -283,10 +287,14 @@ def fit_maps(
                 minimum=minimum,
             )
         )
+    return results
+
+
+def _warn_of_failures(results: list[MapResult]) -> None:
+    """Warn the caller of the public function that called this one."""
     if bad := [result for result in results if not result.success]:
         many = f" ({len(bad)} of {len(results)} problems)" if len(results) > 1 else ""
-        warnings.warn(f"fit_map: {bad[0].message}{many}", RuntimeWarning, stacklevel=2)
-    return results
+        warnings.warn(f"fit_map: {bad[0].message}{many}", RuntimeWarning, stacklevel=3)
 
 
 def new_gaps(
@@ -311,8 +319,8 @@ def new_gaps(
         for side in (first, second)
     ]
     n = len(flat[0])
-    both = jax.tree.map(lambda a, b: np.concatenate([a, b]), *flat)
-    pairs = Comparisons(both, np.arange(n), np.arange(n, 2 * n), np.full(n, 0.5))
+    one, other = flat
+    pairs = Comparisons.from_arrays(one.x, one.u, other.x, other.u, np.full(n, 0.5))
     problem = result.problem
     gap = pair_gaps(pairs, problem.entries, problem.unit, result.outputs)
     return gap, batch, (1 - level) / 2
@@ -381,5 +389,4 @@ def _paired(
 def _status(minimum: Minimum, Q: np.ndarray, R: np.ndarray, tol: float) -> Status:
     if not (np.isfinite(Q).all() and np.isfinite(R).all() and np.isfinite(minimum.objective)):
         return "not_finite"
-    small = minimum.decrement <= 1.01 * tol * (1 + abs(minimum.objective))
-    return "converged" if small else "max_iterations"
+    return "converged" if minimum.converged(tol) else "max_iterations"

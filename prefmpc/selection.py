@@ -120,7 +120,7 @@ def _held_out(problems: list[Any], n: int, folds: int) -> np.ndarray:
 
 def _minima(problems: list[Any]) -> list[np.ndarray]:
     minima = solve(problems, 1e-8, 100)
-    bad = sum(not m.decrement <= 1.01e-8 * (1 + abs(m.objective)) for m in minima)
+    bad = sum(not minimum.converged(1e-8) for minimum in minima)
     if bad:
         raise FitError(f"choose_prior: {bad} of {len(minima)} problems were not solved")
     return [m.w for m in minima]

@@ -13,7 +13,13 @@ from jax.typing import ArrayLike
 from prefmpc._checks import instance, nonnegative, positive_int
 from prefmpc.models import QuadraticCost, SumCost
 from prefmpc.mpc.qp import predicted
-from prefmpc.mpc.solution import MPCError, MPCSolution, check_state
+from prefmpc.mpc.solution import (
+    MPCError,
+    MPCSolution,
+    check_dimension,
+    check_state,
+    infeasible_message,
+)
 from prefmpc.mpc.terminal import TerminalIngredients, stage_constraints
 from prefmpc.networks import ICNNCost
 from prefmpc.sets import Ellipsoid, Polyhedron, SecondOrderCone
@@ -69,10 +75,10 @@ class ConvexMPC:
         nx, nu, N = system.nx, system.nu, self.horizon
         if constraints is not None:
             instance("constraints", constraints, Polyhedron)
-            _fits("constraints", constraints.dim, nx + nu)
+            check_dimension("constraints", constraints.dim, nx + nu)
         for i, cone in enumerate(output_cones):
             instance(f"output_cones[{i}]", cone, SecondOrderCone)
-            _fits(f"output_cones[{i}]", cone.dim, system.ny)
+            check_dimension(f"output_cones[{i}]", cone.dim, system.ny)
         self._x0 = cp.Parameter(nx)
         self._X, self._U = cp.Variable((N + 1, nx)), cp.Variable((N, nu))
         X, U = self._X, self._U
@@ -86,17 +92,17 @@ class ConvexMPC:
             Y = X[:-1] @ system.C.T
             limits.append(cp.norm(Y @ cone.F.T + cone.g, 2, axis=1) <= Y @ cone.c + cone.d)
         if isinstance(terminal, TerminalIngredients):
-            _fits("terminal", len(terminal.P), nx)
+            check_dimension("terminal", len(terminal.P), nx)
             total += cp.sum_squares(np.linalg.cholesky(terminal.P).T @ X[N])
             terminal = terminal.polyhedron
         if isinstance(terminal, Ellipsoid):
-            _fits("terminal", terminal.dim, nx)
+            check_dimension("terminal", terminal.dim, nx)
             if np.isfinite(terminal.level):
                 root = np.linalg.cholesky(terminal.P).T
                 limits.append(cp.norm(root @ X[N], 2) <= np.sqrt(terminal.level))
         elif terminal is not None:
             instance("terminal", terminal, Polyhedron)
-            _fits("terminal", terminal.dim, nx)
+            check_dimension("terminal", terminal.dim, nx)
             if len(terminal.h):
                 limits.append(terminal.H @ X[N] <= terminal.h)
         self._problem = cp.Problem(cp.Minimize(total), limits)
@@ -140,11 +146,7 @@ class ConvexMPC:
         statuses = {
             "optimal": ("solved", "optimal"),
             "optimal_inaccurate": ("solved", f"optimal up to a residual of {residual:.1e}"),
-            "infeasible": (
-                "infeasible",
-                f"no input sequence keeps x(0) = {np.array2string(x0, precision=4)} "
-                f"within the constraints over {N} steps",
-            ),
+            "infeasible": ("infeasible", infeasible_message(x0, N)),
         }
         status, message = statuses.get(said, ("failed", f"Clarabel says {said!r}"))
         inputs, states, cost = np.full((N, nu), np.nan), np.full((N + 1, nx), np.nan), np.nan
@@ -177,11 +179,6 @@ def _residual(details: Any) -> float:
         return float(max(details.r_prim, details.r_dual, gap))
     except AttributeError:
         return np.nan
-
-
-def _fits(name: str, dim: int, wanted: int) -> None:
-    if dim != wanted:
-        raise ValueError(f"{name} must have dimension {wanted}, got {dim}")
 
 
 def expression(cp: Any, cost: Any, X: Any, U: Any) -> Any:

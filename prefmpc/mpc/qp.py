@@ -12,7 +12,14 @@ from scipy.optimize import Bounds, LinearConstraint, milp
 
 from prefmpc._checks import instance, positive_int
 from prefmpc.models import QuadraticCost
-from prefmpc.mpc.solution import MPCError, MPCSolution, check_problem, check_state
+from prefmpc.mpc.solution import (
+    MPCError,
+    MPCSolution,
+    check_dimension,
+    check_problem,
+    check_state,
+    infeasible_message,
+)
 from prefmpc.mpc.terminal import TerminalIngredients
 from prefmpc.sets import Polyhedron
 from prefmpc.systems import LinearSystem
@@ -86,10 +93,8 @@ class LinearMPC:
             if given is None:
                 continue
             instance(name, given, Polyhedron)
-            if given.dim != dim:
-                raise ValueError(f"{name} must have dimension {dim}, got {given.dim}")
-        if final.shape != (system.nx, system.nx):
-            raise ValueError(f"terminal must have dimension {system.nx}, got {len(final)}")
+            check_dimension(name, given.dim, dim)
+        check_dimension("terminal", len(final), system.nx)
         self._build(constraints, terminal, final)
 
     def _build(
@@ -165,11 +170,7 @@ class LinearMPC:
         import osqp
 
         N, nx, nu = self.horizon, self.system.nx, self.system.nu
-        nothing = (
-            "infeasible",
-            f"no input sequence keeps x(0) = {np.array2string(x0, precision=4)} "
-            f"within the constraints over {N} steps",
-        )
+        nothing = "infeasible", infeasible_message(x0, N)
         status, message = {
             osqp.SolverStatus.OSQP_SOLVED: ("solved", "optimal"),
             osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE: nothing,

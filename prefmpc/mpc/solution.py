@@ -77,6 +77,20 @@ def check_problem(system: Any, cost: Any) -> None:
         raise ValueError("cost must have finite weights, got NaN or infinite ones")
 
 
+def check_dimension(name: str, dim: int, wanted: int) -> None:
+    """Raise a ValueError unless the set ``name`` has the wanted dimension."""
+    if dim != wanted:
+        raise ValueError(f"{name} must have dimension {wanted}, got {dim}")
+
+
+def infeasible_message(x0: np.ndarray, horizon: int) -> str:
+    """Say what "infeasible" means for this problem."""
+    return (
+        f"no input sequence keeps x(0) = {np.array2string(x0, precision=4)} "
+        f"within the constraints over {horizon} steps"
+    )
+
+
 def check_state(x0: ArrayLike, nx: int) -> Any:
     """Return x0 (..., nx) as a float64 array, or raise a ValueError that names it."""
     return shaped("x0", finite_array("x0", x0), (nx,), "the system's states")

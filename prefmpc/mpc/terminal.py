@@ -9,7 +9,7 @@ from scipy.optimize import linprog
 
 from prefmpc._checks import instance, nonnegative, positive_int
 from prefmpc.models import QuadraticCost
-from prefmpc.mpc.solution import check_problem
+from prefmpc.mpc.solution import check_dimension, check_problem
 from prefmpc.sets import Ellipsoid, Polyhedron
 from prefmpc.systems import LinearSystem
 
@@ -85,10 +85,7 @@ def terminal_ingredients(
     max_steps, tol = positive_int("max_steps", max_steps), nonnegative("tol", tol)
     if constraints is not None:
         instance("constraints", constraints, Polyhedron)
-        if constraints.dim != system.nx + system.nu:
-            raise ValueError(
-                f"constraints must have dimension {system.nx + system.nu}, got {constraints.dim}"
-            )
+        check_dimension("constraints", constraints.dim, system.nx + system.nu)
     Z = stage_constraints(system, constraints)
     if (Z.h <= 0).any():
         raise ValueError(
