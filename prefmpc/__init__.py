@@ -25,10 +25,12 @@ from prefmpc.mpc import (
     LinearMPC,
     MPCError,
     MPCSolution,
+    StabilityCheck,
     TerminalIngredients,
+    check_stability,
     terminal_ingredients,
 )
-from prefmpc.networks import ICNNCost
+from prefmpc.networks import ICNNCost, soft_constraints
 from prefmpc.pools import lqr_pool, random_states, random_weights
 from prefmpc.preferences import (
     Criterion,
@@ -87,6 +89,7 @@ __all__ = [
     "QuadraticPreference",
     "SecondOrderCone",
     "SettlingTimePreference",
+    "StabilityCheck",
     "SumCost",
     "TerminalIngredients",
     "Trajectory",
@@ -96,6 +99,7 @@ __all__ = [
     "blocks",
     "bryson",
     "by_criterion",
+    "check_stability",
     "choose_prior",
     "closed_loops",
     "erring",
@@ -119,6 +123,7 @@ __all__ = [
     "settling_text",
     "settling_time",
     "simulate",
+    "soft_constraints",
     "terminal_ingredients",
     "win_rate",
 ]

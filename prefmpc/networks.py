@@ -22,6 +22,7 @@ from prefmpc._checks import (
 )
 from prefmpc._pytree import bypass_init, check_index, register_pytree
 from prefmpc._random import generator
+from prefmpc.sets import Polyhedron
 from prefmpc.trajectories import Trajectory
 
 Activation = Literal["softplus", "relu"]
@@ -243,6 +244,33 @@ class ICNNCost:
         c = rng.uniform(0, 2 / sizes[-1], (*shape, sizes[-1]))
         over: Over = "stage" if steps is None else "trajectory"
         return cls(V, b, U, c, scale=size, activation=activation, floor=floor, over=over)
+
+
+def soft_constraints(constraints: Polyhedron, weight: ArrayLike) -> ICNNCost:
+    """Return the penalty Σ_k weightᵀ max(H z_k − h, 0), z_k = (x_k, u_k), as a σ of its own.
+
+    Added to another σ by `SumCost` it lets the constraints be broken, at a price for each unit of
+    H z − h. If the weights exceed the multipliers of the same constraints made hard, the plan is
+    the same as with hard ones wherever these can be met.
+
+    Parameters
+    ----------
+    constraints : Polyhedron
+        Over (x, u), with at least one row.
+    weight : float or array (m,)
+        Nonnegative.
+    """
+    instance("constraints", constraints, Polyhedron)
+    if not len(constraints.h):
+        raise ValueError("constraints must have at least one row, got none")
+    price = np.asarray(finite_array("weight", weight))
+    if price.shape not in ((), constraints.h.shape) or (price < 0).any():
+        raise ValueError(
+            f"weight must be one or {len(constraints.h)} nonnegative numbers, got {price}"
+        )
+    c = np.broadcast_to(price, constraints.h.shape)
+    ones = np.ones(constraints.dim)
+    return ICNNCost([constraints.H], [-constraints.h], [], c, scale=ones, activation="relu")
 
 
 register_pytree(ICNNCost, static=("scale", "activation", "floor", "over"))

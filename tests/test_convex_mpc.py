@@ -21,6 +21,7 @@ from prefmpc import (
     Trajectory,
     oscillating_masses,
     random_states,
+    soft_constraints,
     terminal_ingredients,
 )
 
@@ -161,6 +162,24 @@ def test_cones_and_ellipsoids_hold_and_bind():
     )
     assert solution.cost == pytest.approx(found.fun, rel=1e-5)
     np.testing.assert_allclose(rolled_out(x0, u), x, atol=1e-6)
+
+
+def test_soft_constraints_are_exact_where_hard_ones_can_be_met():
+    wall = Polyhedron([[1.0, 0, 0]], [0.5])
+    lazy = QuadraticCost(0.1 * np.eye(2), [[1.0]])
+    hard = ConvexMPC(SYSTEM, lazy, N, constraints=wall)
+    soft, cheap = (
+        ConvexMPC(SYSTEM, SumCost([lazy, soft_constraints(wall, price)]), N)
+        for price in (100.0, 0.1)
+    )
+    x0 = np.array([0.4, 0.4])
+    assert ConvexMPC(SYSTEM, lazy, N).solve(x0).trajectory.x[:-1, 0].max() > 0.55
+    np.testing.assert_allclose(soft(x0), hard(x0), atol=1e-5)
+    assert soft.solve(x0).cost == pytest.approx(hard.solve(x0).cost, rel=1e-6)
+    assert cheap.solve(x0).trajectory.x[:-1, 0].max() > 0.51
+    x0 = np.array([0.6, 0.0])
+    assert hard.solve(x0).status == "infeasible"
+    assert soft.solve(x0).success
 
 
 def test_the_call_form_and_a_failed_solve():

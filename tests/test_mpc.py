@@ -20,7 +20,7 @@ from prefmpc import (
     oscillating_masses,
     random_states,
 )
-from prefmpc.mpc import batched, qp
+from prefmpc.mpc import _cone, batched, qp
 from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
 KEY = jax.random.key(2000)
@@ -245,14 +245,33 @@ def test_coupled_constraints_and_what_cannot_be_done(clarabel):
     assert matters >= 5
 
 
+@pytest.mark.parametrize("end", [None, Polyhedron.box([-0.4] * 6, [0.3] * 6)])
+def test_what_osqp_leaves_unfinished_is_solved_by_clarabel(monkeypatch, end):
+    wall = Polyhedron(np.eye(8)[:1], [0.25])
+    complete = LinearMPC(MASSES, PAPER, N, constraints=wall, terminal=end)
+    monkeypatch.setitem(qp._SETTINGS, "max_iter", 2)
+    hasty = LinearMPC(MASSES, PAPER, N, constraints=wall, terminal=end)
+    statuses = set()
+    for state in random_states(1.2 * RADIUS, key=KEY, shape=(12,)):
+        expected, answer = complete.solve(state), hasty.solve(state)
+        statuses.add(answer.status)
+        assert answer.status == expected.status
+        if answer.success:
+            assert "by Clarabel after OSQP stopped at 2 iterations" in answer.message
+            np.testing.assert_allclose(answer.trajectory.u, expected.trajectory.u, atol=1e-5)
+            assert answer.cost == pytest.approx(expected.cost, rel=1e-6)
+    assert statuses == {"solved", "infeasible"}
+
+
 def test_too_few_iterations_are_never_silent(monkeypatch):
     monkeypatch.setitem(qp._SETTINGS, "max_iter", 2)
+    monkeypatch.setitem(_cone._TOLERANCES, "max_iter", 1)
     controller = LinearMPC(MASSES, PAPER, N)
     answer = controller.solve(8 * RADIUS)
-    assert (answer.status, answer.success) == ("max_iterations", False)
+    assert (answer.status, answer.success) == ("failed", False)
     assert np.isnan(answer.u).all()
     assert np.isnan(answer.cost)
-    with pytest.raises(MPCError, match=r"max_iterations: .* after 2 iterations"):
+    with pytest.raises(MPCError, match=r"failed: Clarabel says 'MaxIterations'.* 2 iterations"):
         controller(8 * RADIUS)
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from prefmpc import (
     Comparisons,
     ICNNCost,
+    Polyhedron,
     QuadraticCost,
     SumCost,
     Trajectory,
@@ -22,6 +23,7 @@ from prefmpc import (
     fit_map,
     lqr_pool,
     oscillating_masses,
+    soft_constraints,
 )
 from prefmpc.losses import cross_entropy, pair_data
 from prefmpc.studies import RADIUS
@@ -155,6 +157,15 @@ def test_a_sum_by_hand_and_trained():
     assert np.abs(slope.models[0].theta_R).max() > 0 < np.abs(slope.models[1].c).max()
 
 
+def test_soft_constraints_by_hand():
+    penalty = soft_constraints(Polyhedron([[1.0, 0, 0], [0, 0, -2.0]], [0.5, 1.0]), [10.0, 1.0])
+    over = np.maximum(T.x[:, :-1, 0] - 0.5, 0).sum(1)
+    under = np.maximum(-2 * T.u[:, :, 0] - 1, 0).sum(1)
+    assert over.max() > 0 < under.max()
+    np.testing.assert_allclose(penalty(T), 10 * over + under, rtol=1e-12)
+
+
+WALL = Polyhedron([[1.0, 0, 0]], [0.5])
 ONE = {"V": [np.ones((2, 3))], "b": [np.zeros(2)], "U": [], "c": np.ones(2)}
 TWO = {"V": [np.ones((2, 3))] * 2, "b": [np.zeros(2)] * 2, "U": [np.ones((2, 2))], "c": np.ones(2)}
 
@@ -181,6 +192,13 @@ TWO = {"V": [np.ones((2, 3))] * 2, "b": [np.zeros(2)] * 2, "U": [np.ones((2, 2))
             "trajectory.u must have shape",
         ),
         (lambda: ICNNCost.random(SCALE, key=jax.random.key(0), widths=()), "widths must name at"),
+        (lambda: soft_constraints(1, 1.0), "constraints must be a Polyhedron, got int"),
+        (lambda: soft_constraints(WALL, -1.0), "weight must be one or 1 nonnegative numbers"),
+        (lambda: soft_constraints(WALL, [1.0, 1.0]), "weight must be one or 1 nonnegative"),
+        (
+            lambda: soft_constraints(Polyhedron(np.zeros((0, 3)), np.zeros(0)), 1.0),
+            "constraints must have at least one row",
+        ),
         (lambda: SumCost([]), "models must be a sequence of at least one"),
         (lambda: SumCost([1]), r"models\[0\] must be a σ model, got int"),
         (lambda: SumCost([ICNNCost(**ONE, scale=SCALE)], [1, 2]), "weights must be 1 numbers"),

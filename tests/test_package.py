@@ -133,7 +133,7 @@ LAYERS = {
         *HELPERS,
         *("_newton", "trajectories", "comparisons", "models", "losses", "priors"),
     },
-    "networks": HELPERS | {"trajectories"},
+    "networks": HELPERS | {"trajectories", "sets"},
     "mpc": HELPERS | {"systems", "sets", "trajectories", "models", "networks", "mpc"},
     "evaluation": {
         *HELPERS,
@@ -183,6 +183,7 @@ MADE = {
         "Moments",
         "Posterior",
         "PriorChoice",
+        "StabilityCheck",
         "TerminalIngredients",
         "WinRate",
     ),

@@ -4,6 +4,7 @@ from prefmpc.mpc.batched import BatchedMPC
 from prefmpc.mpc.convex import ConvexMPC
 from prefmpc.mpc.qp import LinearMPC
 from prefmpc.mpc.solution import MPCError, MPCSolution
+from prefmpc.mpc.stability import StabilityCheck, check_stability
 from prefmpc.mpc.terminal import TerminalIngredients, terminal_ingredients
 
 __all__ = [
@@ -12,6 +13,8 @@ __all__ = [
     "LinearMPC",
     "MPCError",
     "MPCSolution",
+    "StabilityCheck",
     "TerminalIngredients",
+    "check_stability",
     "terminal_ingredients",
 ]

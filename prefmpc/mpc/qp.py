@@ -1,17 +1,18 @@
-"""Linear MPC with a quadratic σ as a sparse quadratic program, solved by OSQP."""
+"""Linear MPC with a quadratic σ as a sparse quadratic program for OSQP; Clarabel stands by."""
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 from jax.typing import ArrayLike
-from scipy.optimize import Bounds, LinearConstraint, milp
 
 from prefmpc._checks import instance, positive_int
 from prefmpc.models import QuadraticCost
+from prefmpc.mpc._cone import ConeProgram, ConeSolution
 from prefmpc.mpc.solution import (
     MPCError,
     MPCSolution,
@@ -19,11 +20,11 @@ from prefmpc.mpc.solution import (
     check_problem,
     check_state,
     infeasible_message,
+    predicted,
 )
 from prefmpc.mpc.terminal import TerminalIngredients
 from prefmpc.sets import Polyhedron
 from prefmpc.systems import LinearSystem
-from prefmpc.trajectories import Trajectory
 
 # OSQP's own default of 1e-3 leaves inputs off by 4e-3.
 _SETTINGS = {
@@ -34,8 +35,6 @@ _SETTINGS = {
     "max_iter": 20_000,
     "verbose": False,
 }
-
-_ANYTHING = Bounds(-np.inf, np.inf)
 
 
 class LinearMPC:
@@ -132,9 +131,11 @@ class LinearMPC:
             upper.append(terminal.h)
         self._rows = sp.vstack(rows, format="csc")
         self._lower, self._upper = np.concatenate(lower), np.concatenate(upper)
+        self._P = sp.triu(P, format="csc")
+        self._backup: ConeProgram | None = None
         self._solver = osqp.OSQP()
         self._solver.setup(
-            sp.triu(P, format="csc"),  # OSQP reads a lower triangle without complaint, and wrongly
+            self._P,  # OSQP reads a lower triangle without complaint, and wrongly
             np.zeros(states + inputs),
             self._rows,
             self._lower,
@@ -151,7 +152,7 @@ class LinearMPC:
         self._lower[: x0.size] = self._upper[: x0.size] = -x0
         self._solver.update(l=self._lower, u=self._upper)
         result = self._solver.solve(raise_error=False)
-        return self._solution(x0, result, time.perf_counter() - began)
+        return self._solution(x0, result, began)
 
     def __call__(self, x0: ArrayLike) -> np.ndarray:
         """Return the input to apply, u*_0 (nu,). Raises an `MPCError` if the solve failed."""
@@ -160,52 +161,63 @@ class LinearMPC:
             raise MPCError(solution)
         return solution.u
 
-    def _feasible(self) -> bool:
-        """Whether any point satisfies the constraints: a linear program, where OSQP cannot tell."""
-        limits = LinearConstraint(self._rows, self._lower, self._upper)
-        answer = milp(np.zeros(self._rows.shape[1]), constraints=limits, bounds=_ANYTHING)
-        return int(answer.status) != 2
+    def _by_interior_point(self, iterations: int) -> ConeSolution:
+        """Solve with Clarabel what OSQP gave up on: problems with hardly any room, as a rule."""
+        import clarabel
 
-    def _solution(self, x0: np.ndarray, result: Any, seconds: float) -> MPCSolution:
+        if self._backup is None:
+            same = self._lower == self._upper
+            # A z = b, then A z ≤ upper, then −A z ≤ −lower, where these are finite.
+            self._split = same, ~same & np.isfinite(self._upper), ~same & np.isfinite(self._lower)
+            equal, above, below = (self._rows.tocsr()[part] for part in self._split)
+            rows = sp.vstack([equal, above, -below])
+            cones = [
+                clarabel.ZeroConeT(equal.shape[0]),
+                clarabel.NonnegativeConeT(above.shape[0] + below.shape[0]),
+            ]
+            nothing = np.zeros(rows.shape[1])
+            self._backup = ConeProgram(self._P, nothing, rows, self._right_hand_side(), cones)
+        found = self._backup.solve(self._right_hand_side())
+        note = f"{found.message}, by Clarabel after OSQP stopped at {iterations} iterations"
+        return dataclasses.replace(found, message=note)
+
+    def _right_hand_side(self) -> np.ndarray:
+        same, above, below = self._split
+        return np.concatenate([self._upper[same], self._upper[above], -self._lower[below]])
+
+    def _solution(self, x0: np.ndarray, result: Any, began: float) -> MPCSolution:
         import osqp
 
         N, nx, nu = self.horizon, self.system.nx, self.system.nu
-        nothing = "infeasible", infeasible_message(x0, N)
-        status, message = {
-            osqp.SolverStatus.OSQP_SOLVED: ("solved", "optimal"),
-            osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE: nothing,
-            osqp.SolverStatus.OSQP_MAX_ITER_REACHED: (
-                "max_iterations",
-                f"no solution of the wanted accuracy after {result.info.iter} iterations",
-            ),
-        }.get(result.info.status_val, ("failed", f"OSQP says {result.info.status!r}"))
-        if status not in ("solved", "infeasible") and not self._feasible():
-            status, message = nothing
+        found = ConeSolution(
+            z=np.asarray(result.x),
+            objective=float(result.info.obj_val),
+            status={
+                osqp.SolverStatus.OSQP_SOLVED: "solved",
+                osqp.SolverStatus.OSQP_PRIMAL_INFEASIBLE: "infeasible",
+            }.get(result.info.status_val, "unfinished"),
+            message="optimal",
+            iterations=int(result.info.iter),
+            residual=max(float(result.info.prim_res), float(result.info.dual_res)),
+        )
+        if found.status == "unfinished" or not np.isfinite(found.z).all():
+            found = self._by_interior_point(found.iterations)
+        message = infeasible_message(x0, N) if found.status == "infeasible" else found.message
         inputs = np.full((N, nu), np.nan)
         states = np.full((N + 1, nx), np.nan)
         cost = np.nan
-        if status == "solved" and not np.isfinite(result.x).all():
-            status, message = "failed", "OSQP returned values that are not finite"
-        if status == "solved":
-            states, inputs = np.split(result.x, [nx * (N + 1)])
+        if found.status == "solved":
+            states, inputs = np.split(found.z, [nx * (N + 1)])
             states = states.reshape(N + 1, nx)
             inputs = np.clip(inputs.reshape(N, nu), self.system.u_min, self.system.u_max)
-            cost = float(result.info.obj_val)
+            cost = found.objective
         return MPCSolution(
             u=inputs[0],
             trajectory=predicted(self.system, states, inputs),
             cost=cost,
-            status=status,
+            status=found.status,
             message=message,
-            iterations=int(result.info.iter),
-            residual=max(float(result.info.prim_res), float(result.info.dual_res)),
-            seconds=seconds,
+            iterations=found.iterations,
+            residual=found.residual,
+            seconds=time.perf_counter() - began,
         )
-
-
-def predicted(system: LinearSystem, states: np.ndarray, inputs: np.ndarray) -> Trajectory:
-    """Return a plan as a trajectory, NaN where the solve failed."""
-    from prefmpc._pytree import bypass_init
-
-    # Built without validation: the values of a failed solve are NaN on purpose.
-    return bypass_init(Trajectory, x=states, u=inputs, y=states[:-1] @ system.C.T)

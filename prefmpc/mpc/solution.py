@@ -9,6 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from prefmpc._checks import finite_array, shaped
+from prefmpc._pytree import bypass_init
 from prefmpc.models import QuadraticCost
 from prefmpc.systems import LinearSystem
 from prefmpc.trajectories import Trajectory
@@ -94,3 +95,9 @@ def infeasible_message(x0: np.ndarray, horizon: int) -> str:
 def check_state(x0: ArrayLike, nx: int) -> Any:
     """Return x0 (..., nx) as a float64 array, or raise a ValueError that names it."""
     return shaped("x0", finite_array("x0", x0), (nx,), "the system's states")
+
+
+def predicted(system: LinearSystem, states: np.ndarray, inputs: np.ndarray) -> Trajectory:
+    """Return a plan as a trajectory, NaN where the solve failed."""
+    # Built without validation: the values of a failed solve are NaN on purpose.
+    return bypass_init(Trajectory, x=states, u=inputs, y=states[:-1] @ system.C.T)
