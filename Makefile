@@ -70,6 +70,7 @@ lab: $(LAB_STAMP)
 bench: $(STAMP)
 	@$(BIN)/python -W ignore benchmarks/speed.py
 	@$(BIN)/python -W ignore benchmarks/learning.py
+	@$(BIN)/python -W ignore benchmarks/solvers.py
 
 # ---- the checks ----
 

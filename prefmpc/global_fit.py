@@ -155,7 +155,7 @@ def _barrier(
 ) -> tuple[np.ndarray, float, float, str, int]:
     rows, columns = _packed_places(len(like.Q), len(like.R))
     entries, lowest = Entries.of(rows, columns), _lowest(like)
-    scaled = data.second.T, data.labels, data.weights / data.weights.sum()
+    scaled = data.features.T, data.labels, data.weights / data.weights.sum()
     w, value, gap, steps = to_numpy(_follow(*scaled, entries, lowest, l2))
     status = "converged" if gap <= GAP * value else "max_iterations"
     if not (np.isfinite(w).all() and np.isfinite(value)):
@@ -237,7 +237,7 @@ def _clarabel(
             corner[k, k] = c**2
             bounds.append(M[: k + 1, : k + 1] - corner >> 0)
     rows, columns = _packed_places(nx, len(like.R))
-    z = (data.second * unit[rows] * unit[columns]) @ cp.hstack(packed)
+    z = (data.features * unit[rows] * unit[columns]) @ cp.hstack(packed)
     mean = cp.sum(cp.logistic(z) - cp.multiply(data.labels, z)) / len(data.labels)
     trace = unit**2 @ cp.hstack([cp.diag(M) for M in matrices])
     problem = cp.Problem(cp.Minimize((mean + l2 * trace) / size), bounds)

@@ -14,6 +14,9 @@ from prefmpc.comparisons import Comparisons
 SMALLEST_SHAPE = 1024
 """Data sets are padded to this many pairs, or to the next power of two above it."""
 
+SMALLEST_POOL = 128
+"""The same for the number of trajectories, where σ is computed once for each of them."""
+
 
 class FitError(RuntimeError):
     """No model was learned that may be used."""
@@ -25,13 +28,15 @@ def padded_size(n: int) -> int:
 
 
 class PairData(NamedTuple):
-    """Pairs ready for the loss: features of both sides, labels and weights, leading size n.
+    """Pairs ready for the loss: labels and weights with leading size n, and what σ needs.
 
-    For a model that is linear in its features ``first`` is None and ``second`` the difference.
+    For a model that is linear in its features ``sides`` is None and ``features`` holds the
+    difference, second minus first. For others ``features`` holds every trajectory once, so that σ
+    is computed once for each, and ``sides`` says which two of them are compared.
     """
 
-    first: Any
-    second: Any
+    sides: Any
+    features: Any
     labels: Any
     weights: Any
 
@@ -40,19 +45,27 @@ def pair_data(model: Any, comparisons: Comparisons, size: int | None = None) -> 
     """Compute the features of all pairs once, padded with pairs of weight 0 to ``size``."""
     n = len(comparisons)
     size = n if size is None else size
-    with np.errstate(over="ignore"):  # said in one sentence below
-        features = jax.tree.map(np.asarray, model.features(comparisons.trajectories))
-    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(features)):
-        raise ValueError("trajectories must have finite features, got NaN or an overflow")
     padding = np.zeros(size - n, dtype=int)
     i = np.concatenate([comparisons.first, padding])
     j = np.concatenate([comparisons.second, padding])
-    first = jax.tree.map(lambda leaf: leaf[i], features)
-    second = jax.tree.map(lambda leaf: leaf[j], features)
-    if model.linear_in_features:
-        first, second = None, jax.tree.map(np.subtract, second, first)
+    used, sides = np.unique(np.stack([i, j]), return_inverse=True)
+    if not model.linear_in_features and size > n:
+        used = np.concatenate([used, np.full(_padded_pool(len(used)) - len(used), used[0])])
+    with np.errstate(over="ignore"):  # said in one sentence below
+        features = jax.tree.map(np.asarray, model.features(comparisons.trajectories[used]))
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(features)):
+        raise ValueError("trajectories must have finite features, got NaN or an overflow")
     labels = np.concatenate([comparisons.labels, padding])
-    return PairData(first, second, labels, np.concatenate([np.ones(n), padding]))
+    weights = np.concatenate([np.ones(n), padding])
+    first, second = sides.reshape(2, size)
+    if model.linear_in_features:
+        gap = jax.tree.map(lambda leaf: leaf[second] - leaf[first], features)
+        return PairData(None, gap, labels, weights)
+    return PairData((first, second), features, labels, weights)
+
+
+def _padded_pool(count: int) -> int:
+    return max(SMALLEST_POOL, 1 << (count - 1).bit_length())
 
 
 def logits(model: Any, data: PairData) -> Any:
@@ -60,9 +73,11 @@ def logits(model: Any, data: PairData) -> Any:
 
     Implements the exponent of eq. (4) of arXiv 2511.22502.
     """
-    if data.first is None:
-        return model.score(data.second)
-    return model.score(data.second) - model.score(data.first)
+    score = model.score(data.features)
+    if data.sides is None:
+        return score
+    first, second = data.sides
+    return score[second] - score[first]
 
 
 def cross_entropy(model: Any, data: PairData) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ from prefmpc._random import generator
 from prefmpc.sets import Polyhedron
 from prefmpc.trajectories import Trajectory
 
-Activation = Literal["softplus", "relu"]
+Activation = Literal["softplus", "relu", "squared_relu"]
 Over = Literal["stage", "trajectory"]
 
 
@@ -54,10 +54,14 @@ class ICNNCost:
         Nonnegative.
     scale : array (n_x + n_u,)
         Positive; the size of each signal, so that v is of order one.
-    activation : {"softplus", "relu"}
+    activation : {"softplus", "relu", "squared_relu"}
+        g(a) = log(1 + eᵃ), max(a, 0) or max(a, 0)².
     floor : float
         Nonnegative. Positive: σ is strictly convex.
     over : {"stage", "trajectory"}
+    bias : bool
+        False: all b are 0 and stay so. With a ReLU, squared or not, σ is then 0 at the origin and
+        nowhere smaller: the set point is kept, whatever is learned.
 
     Raises
     ------
@@ -73,6 +77,7 @@ class ICNNCost:
     activation: Activation
     floor: float
     over: Over
+    bias: bool
 
     linear_in_features = False
 
@@ -87,9 +92,12 @@ class ICNNCost:
         activation: Activation = "softplus",
         floor: float = 0.0,
         over: Over = "stage",
+        bias: bool = True,
     ) -> None:
-        if activation not in ("softplus", "relu"):
-            raise ValueError(f'activation must be "softplus" or "relu", got {activation!r}')
+        if activation not in get_args(Activation):
+            raise ValueError(
+                f"activation must be one of {get_args(Activation)}, got {activation!r}"
+            )
         if over not in ("stage", "trajectory"):
             raise ValueError(f'over must be "stage" or "trajectory", got {over!r}')
         size = np.asarray(finite_array("scale", scale, ndim=1))
@@ -121,6 +129,8 @@ class ICNNCost:
                     raise ValueError(
                         f"{label} must have shape {(*lead, *shape)}, got {array.shape}"
                     )
+                if name == "b" and not bias and array.any():
+                    raise ValueError(f"{label} must be zero for a network without bias")
                 if name in "Uc" and (array < 0).any():
                     raise ValueError(
                         f"{label} must not be negative, else σ is not convex; got {array.min():.3g}"
@@ -139,6 +149,7 @@ class ICNNCost:
             "activation": activation,
             "floor": nonnegative("floor", floor),
             "over": over,
+            "bias": bool(bias),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -188,21 +199,26 @@ class ICNNCost:
         return self._network(v).sum(-1)
 
     def _network(self, v: Any) -> Any:
-        act = jax.nn.relu if self.activation == "relu" else jax.nn.softplus
+        act = {
+            "softplus": jax.nn.softplus,
+            "relu": jax.nn.relu,
+            "squared_relu": lambda a: jax.nn.relu(a) ** 2,
+        }[self.activation]
         z = act(v @ self.V[0].T + self.b[0])
         for V, b, U in zip(self.V[1:], self.b[1:], self.U, strict=True):
             z = act(z @ U.T + v @ V.T + b)
         return z @ self.c + self.floor * (v * v).sum(-1)
 
     def bounds(self) -> tuple[ICNNCost, ICNNCost]:
-        """Return the bounds that keep σ convex as two models: U ≥ 0 and c ≥ 0."""
-        low = jax.tree.map(lambda leaf: np.full(leaf.shape, -np.inf), self)
-        zero = {
-            "U": tuple(np.zeros(leaf.shape) for leaf in self.U),
-            "c": np.zeros(self.c.shape),
-        }
-        low = bypass_init(ICNNCost, **{**_fields(low), **zero})
-        return low, jax.tree.map(lambda leaf: np.full(leaf.shape, np.inf), self)
+        """Return the bounds that keep σ convex as two models: U ≥ 0, c ≥ 0; without bias b = 0."""
+        low, high = (
+            jax.tree.map(lambda leaf, side=side: np.full(leaf.shape, side), self)
+            for side in (-np.inf, np.inf)
+        )
+        zero = jax.tree.map(lambda leaf: np.zeros(leaf.shape), self)
+        held = {} if self.bias else {"b": zero.b}
+        low = bypass_init(ICNNCost, **{**_fields(low), "U": zero.U, "c": zero.c, **held})
+        return low, bypass_init(ICNNCost, **{**_fields(high), **held})
 
     @classmethod
     def random(
@@ -215,6 +231,7 @@ class ICNNCost:
         shape: tuple[int, ...] = (),
         activation: Activation = "softplus",
         floor: float = 0.0,
+        bias: bool = True,
     ) -> ICNNCost:
         """Draw a stack of networks to start training from.
 
@@ -236,14 +253,15 @@ class ICNNCost:
         n_v = size.size if steps is None else size.size * positive_int("steps", steps)
         rng = generator(key)
         V = [rng.standard_normal((*shape, width, n_v)) / np.sqrt(n_v) for width in sizes]
-        b = [0.1 * rng.standard_normal((*shape, width)) for width in sizes]
+        b = [bias * 0.1 * rng.standard_normal((*shape, width)) for width in sizes]
         U = [
             rng.uniform(0, 2 / before, (*shape, after, before))
             for before, after in itertools.pairwise(sizes)
         ]
         c = rng.uniform(0, 2 / sizes[-1], (*shape, sizes[-1]))
         over: Over = "stage" if steps is None else "trajectory"
-        return cls(V, b, U, c, scale=size, activation=activation, floor=floor, over=over)
+        options: dict[str, Any] = {"activation": activation, "floor": floor, "bias": bias}
+        return cls(V, b, U, c, scale=size, over=over, **options)
 
 
 def soft_constraints(constraints: Polyhedron, weight: ArrayLike) -> ICNNCost:
@@ -273,7 +291,7 @@ def soft_constraints(constraints: Polyhedron, weight: ArrayLike) -> ICNNCost:
     return ICNNCost([constraints.H], [-constraints.h], [], c, scale=ones, activation="relu")
 
 
-register_pytree(ICNNCost, static=("scale", "activation", "floor", "over"))
+register_pytree(ICNNCost, static=("scale", "activation", "floor", "over", "bias"))
 
 
 def _fields(model: ICNNCost) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
@@ -24,6 +26,7 @@ from prefmpc import (
     soft_constraints,
     terminal_ingredients,
 )
+from prefmpc.mpc import _cone
 
 SYSTEM = LinearSystem([[1.0, 0.2], [-0.1, 0.9]], [[0.0], [0.3]], dt=0.1, u_min=-1, u_max=1)
 COST = QuadraticCost([[3.0, 0.5], [0.5, 1.0]], [[0.4]])
@@ -112,8 +115,10 @@ def test_a_relu_network_is_a_linear_program(steps):
         assert model(plan) == pytest.approx(solution.cost, rel=1e-6, abs=1e-6)
 
 
-def test_a_softplus_network_with_a_quadratic_agrees_with_slsqp():
-    network = ICNNCost.random(SCALE, key=jax.random.key(2602), widths=(4, 3), floor=0.1)
+@pytest.mark.parametrize("activation", ["softplus", "squared_relu"])
+def test_a_smooth_network_with_a_quadratic_agrees_with_slsqp(activation):
+    kind = {"widths": (4, 3), "floor": 0.1, "activation": activation}
+    network = ICNNCost.random(SCALE, key=jax.random.key(2602), **kind)
     model = SumCost([COST, network], [0.5, 2.0])
     controller = ConvexMPC(SYSTEM, model, N)
     for x0 in STATES[:3]:
@@ -191,6 +196,23 @@ def test_the_call_form_and_a_failed_solve():
     assert np.isnan(solution.u).all()
     assert np.isnan(solution.cost)
     assert controller.solve([0.01, 0.0]).success  # and the next one is fine again
+
+
+def test_an_unlucky_solve_is_tried_again(monkeypatch):
+    controller, tries = ConvexMPC(SYSTEM, COST, N), []
+    expected = controller.solve(STATES[0])
+    run = _cone.ConeProgram._run
+
+    def unlucky(solver, b):
+        tries.append(run(solver, b))
+        return dataclasses.replace(tries[-1], status="failed") if len(tries) % 3 else tries[-1]
+
+    monkeypatch.setattr(_cone.ConeProgram, "_run", staticmethod(unlucky))
+    again = controller.solve(STATES[0])
+    assert (len(tries), again.status) == (3, "solved")
+    np.testing.assert_allclose(again.trajectory.u, expected.trajectory.u, atol=1e-6)
+    monkeypatch.setattr(_cone, "_SECOND_TRIES", ())
+    assert controller.solve(STATES[0]).status == "failed"
 
 
 def test_a_second_order_cone_by_hand():

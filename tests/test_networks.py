@@ -43,12 +43,17 @@ def by_hand(model, x, u):
         z = np.zeros(0)
         for i, (V, b) in enumerate(zip(model.V, model.b, strict=True)):
             before = V @ v + b + (model.U[i - 1] @ z if i else 0)
-            z = np.maximum(before, 0) if model.activation == "relu" else np.logaddexp(before, 0)
+            positive = np.maximum(before, 0)
+            z = {
+                "relu": positive,
+                "squared_relu": positive**2,
+                "softplus": np.logaddexp(before, 0),
+            }[model.activation]
         total += z @ model.c + model.floor * v @ v
     return total
 
 
-@pytest.mark.parametrize("activation", ["relu", "softplus"])
+@pytest.mark.parametrize("activation", ["relu", "softplus", "squared_relu"])
 @pytest.mark.parametrize("steps", [None, 3])
 def test_an_icnn_by_hand(activation, steps):
     model = ICNNCost.random(
@@ -86,13 +91,15 @@ def test_gradients_are_those_of_finite_differences():
 @settings(max_examples=60)
 @given(
     st.integers(0, 10_000),
-    st.sampled_from(["relu", "softplus"]),
+    st.sampled_from(["relu", "softplus", "squared_relu"]),
     st.sampled_from([None, 3]),
+    st.booleans(),
     st.floats(0, 1),
 )
-def test_convex_whatever_the_weights_within_the_bounds(seed, activation, steps, mix):
+def test_convex_whatever_the_weights_within_the_bounds(seed, activation, steps, bias, mix):
     rng = np.random.default_rng(seed)
-    start = ICNNCost.random(SCALE, key=rng, widths=(5, 4), steps=steps, activation=activation)
+    options = {"steps": steps, "activation": activation, "bias": bias}
+    start = ICNNCost.random(SCALE, key=rng, widths=(5, 4), **options)
     low, high = start.bounds()
     wild = jax.tree.map(lambda leaf: leaf + 3 * rng.normal(size=leaf.shape), start)
     model = jax.tree.map(np.clip, wild, low, high)
@@ -100,6 +107,8 @@ def test_convex_whatever_the_weights_within_the_bounds(seed, activation, steps, 
     between = jax.tree.map(lambda p, q: mix * p + (1 - mix) * q, a, b)
     chord = mix * model(a) + (1 - mix) * model(b)
     assert model(between) <= chord + 1e-9 * (1 + abs(chord))
+    if not bias and activation != "softplus":  # the set point is kept
+        assert model(jax.tree.map(np.zeros_like, a)) == 0 <= model(a)
 
 
 def test_a_floor_makes_it_strictly_convex():
@@ -119,11 +128,13 @@ def test_training_keeps_it_convex_and_learns_what_a_quadratic_cannot():
     fresh = lqr_pool(oscillating_masses(), 40, 10, key=jax.random.key(2502), radius=RADIUS)
     test = Comparisons.random(fresh, person, 300, key=jax.random.key(2503))
     scale = np.concatenate([np.abs(POOL.x).max((0, 1)), [1, 1]])
-    starts = ICNNCost.random(scale, key=jax.random.key(2504), widths=(6,), shape=(2,))
+    kind = {"activation": "squared_relu", "bias": False}
+    starts = ICNNCost.random(scale, key=jax.random.key(2504), widths=(6,), shape=(2,), **kind)
     options = {"key": jax.random.key(0), "selection": "training_loss", "max_iterations": 60}
     result = fit(data, starts, tol=1e-1, l2=1e-4, adam_steps=400, **options)
     model = result.model
     assert min(leaf.min() for leaf in (*model.U, model.c)) >= 0
+    assert not model.b[0].any()
     quadratic = fit_map(data, bryson(scale[:6], [1, 1])).model
     assert accuracy(model, test) > accuracy(quadratic, test) + 0.05
 
@@ -173,7 +184,11 @@ TWO = {"V": [np.ones((2, 3))] * 2, "b": [np.zeros(2)] * 2, "U": [np.ones((2, 2))
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: ICNNCost(**ONE, scale=SCALE, activation="tanh"), "activation must be"),
+        (lambda: ICNNCost(**ONE, scale=SCALE, activation="tanh"), "activation must be one of"),
+        (
+            lambda: ICNNCost(**{**ONE, "b": [np.ones(2)]}, scale=SCALE, bias=False),
+            r"b\[0\] must be zero for a network without bias",
+        ),
         (lambda: ICNNCost(**ONE, scale=SCALE, over="time"), 'over must be "stage" or'),
         (lambda: ICNNCost(**ONE, scale=-SCALE), "scale must hold positive numbers"),
         (lambda: ICNNCost(**ONE, scale=SCALE, floor=-1), "floor must be finite and at least 0"),

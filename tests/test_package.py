@@ -142,7 +142,7 @@ LAYERS = {
     "studies": {
         *HELPERS,
         *("systems", "sets", "trajectories", "pools", "preferences", "comparisons", "models"),
-        *("training", "priors", "convex", "uncertainty", "selection"),
+        *("networks", "training", "priors", "convex", "uncertainty", "selection"),
         *("mpc", "evaluation", "studies"),
     },
     "plots": set(),

@@ -12,7 +12,7 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import instance, positive_int
 from prefmpc.models import QuadraticCost
-from prefmpc.mpc._cone import ConeProgram, ConeSolution
+from prefmpc.mpc._cone import TIGHT, ConeProgram, ConeSolution
 from prefmpc.mpc.solution import (
     MPCError,
     MPCSolution,
@@ -42,7 +42,7 @@ class LinearMPC:
 
     Implements eq. (7) of arXiv 2511.22502 for a linear plant, polyhedral sets and quadratic σ;
     with input bounds alone this is eq. (12). The problem is set up once; each solve only changes
-    the initial state.
+    the initial state. OSQP solves it, warm; Clarabel solves what OSQP does not finish.
 
     Parameters
     ----------
@@ -176,7 +176,9 @@ class LinearMPC:
                 clarabel.NonnegativeConeT(above.shape[0] + below.shape[0]),
             ]
             nothing = np.zeros(rows.shape[1])
-            self._backup = ConeProgram(self._P, nothing, rows, self._right_hand_side(), cones)
+            self._backup = ConeProgram(
+                self._P, nothing, rows, self._right_hand_side(), cones, TIGHT
+            )
         found = self._backup.solve(self._right_hand_side())
         note = f"{found.message}, by Clarabel after OSQP stopped at {iterations} iterations"
         return dataclasses.replace(found, message=note)

@@ -42,7 +42,8 @@ class MPCSolution:
     iterations : int, or int array (...)
     residual : float, or array (...)
         How far from optimal: for `LinearMPC` the larger of the primal and dual residual, for
-        `BatchedMPC` a proven bound on the distance of the inputs from the optimal ones.
+        `ConvexMPC` the largest of these and the relative duality gap, for `BatchedMPC` a proven
+        bound on the distance of the inputs from the optimal ones.
     seconds : float
         Wall time of the solve.
     """

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from prefmpc.studies import measures, priors, quadratic, settling
+from prefmpc.studies import measures, onesided, priors, quadratic, settling, stability
 from prefmpc.studies.spread import write_spread
 
 BOOK = Path(__file__).parents[2] / "book"
@@ -69,6 +69,19 @@ STUDIES: dict[str, Study] = {
             **{"cases": priors.CASES, "methods": priors.METHODS},
             **{"sizes": priors.ASKED, "levels": priors.LEVELS},
         },
+    ),
+    "onesided": (
+        onesided.onesided_case,
+        "extensions/onesided_spread.json",
+        {
+            **{"sizes": onesided.ONESIDED_SIZES, "learners": onesided.LEARNERS},
+            "controllers": onesided.CONTROLLERS,
+        },
+    ),
+    "stability": (
+        stability.stability_case,
+        "extensions/stability_spread.json",
+        {"plants": stability.PLANTS, "checks": stability.CHECKS},
     ),
     "measures": (
         measures.measures_case,

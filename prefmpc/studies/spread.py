@@ -12,7 +12,8 @@ import numpy as np
 
 
 def write_spread(path: Path, head: Mapping[str, Any], draws: Sequence[Mapping[str, Any]]) -> None:
-    """Write ``head`` and the named arrays of every draw, a line each, rounded to 4 digits.
+    """Write ``head`` and the named arrays of every draw, a line each, rounded to 4 decimals,
+    small ones to 3 digits.
 
     NaN is written as null and infinity as the text "inf". An interrupted write leaves an old file
     whole.
@@ -23,7 +24,9 @@ def write_spread(path: Path, head: Mapping[str, Any], draws: Sequence[Mapping[st
             return [plain(part) for part in value]
         if np.isnan(value):
             return None
-        return round(float(value), 4) if np.isfinite(value) else str(value)
+        if not np.isfinite(value):
+            return str(value)
+        return round(float(value), 4) if abs(value) >= 0.01 else float(f"{value:.3g}")
 
     rows = [
         json.dumps({k: plain(np.asarray(v)) for k, v in draw.items()}, ensure_ascii=False)
