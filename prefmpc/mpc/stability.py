@@ -100,7 +100,7 @@ def check_stability(
     cost : QuadraticCost, ICNNCost or SumCost of these
     constraints, output_cones : as for `ConvexMPC`
     tol : float
-        Largest `gap`, relative to 1 + |ℓ(z_s)|, that counts as none.
+        Largest `gap`, relative to 1 + abs(ℓ(z_s)), that counts as none.
 
     Returns
     -------
