@@ -352,8 +352,8 @@ def test_files_give_back_what_was_drawn(tmp_path):
     stored = read_spread(str(path))
     assert list(stored) == ["table", "number"]
     np.testing.assert_array_equal(
-        stored["table"], [[[1, np.nan], [np.inf, 2]], [[-np.inf, 0], [0, 1e6]]]
-    )  # four digits
+        stored["table"], [[[1, np.nan], [np.inf, 2]], [[-np.inf, 0], [-1e-9, 1e6]]]
+    )  # four decimals, and small numbers stay
     np.testing.assert_array_equal(stored["number"], [3, np.nan])
     text = path.read_text(encoding="utf-8")
     assert len(text.splitlines()) == len(DRAWS) + 2  # a line for each draw, to see what changed
