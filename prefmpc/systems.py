@@ -157,22 +157,21 @@ class LinearSystem:
                 f"Q and R must have shapes {self.A.shape} and {(self.nu, self.nu)}, "
                 f"got {Q.shape} and {R.shape}"
             )
-        mode = _unstabilisable_mode(self.A, self.B)
-        if mode is not None:
-            raise ValueError(
-                f"the pair (A, B) must be stabilisable, got a mode {mode:.4g} with "
-                f"|mode| = {abs(mode):.4g} that no input reaches"
-            )
         try:
             P = scipy.linalg.solve_discrete_are(self.A, self.B, Q, R)
+            K = np.linalg.solve(R + self.B.T @ P @ self.B, self.B.T @ P @ self.A)
+            radius = float(np.abs(np.linalg.eigvals(self.A - self.B @ K)).max())
+            if radius >= 1:
+                raise np.linalg.LinAlgError(f"the closed loop has radius {radius:.6g}")
         except np.linalg.LinAlgError as error:
+            # Only now: a mode that no input reaches stays in the closed loop, so this is caught.
+            mode = _unstabilisable_mode(self.A, self.B)
+            if mode is not None:
+                raise ValueError(
+                    f"the pair (A, B) must be stabilisable, got a mode {mode:.4g} with "
+                    f"|mode| = {abs(mode):.4g} that no input reaches"
+                ) from None
             raise ValueError(f"Q must see every undamped mode of A: {error}") from None
-        K = np.linalg.solve(R + self.B.T @ P @ self.B, self.B.T @ P @ self.A)
-        radius = float(np.abs(np.linalg.eigvals(self.A - self.B @ K)).max())
-        if radius >= 1:
-            raise ValueError(
-                f"Q must see every undamped mode of A: the closed loop has radius {radius:.6g}"
-            )
         return K, P
 
 

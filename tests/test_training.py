@@ -85,7 +85,7 @@ def test_the_sign_of_the_loss():
 
 def test_padding_does_not_count():
     plain, padded = pair_data(COST, FEW), pair_data(COST, FEW, 64)
-    assert padded.second.shape[0] == padded.labels.size == padded.weights.size == 64
+    assert padded.features.shape[0] == padded.labels.size == padded.weights.size == 64
     expected = float(cross_entropy(COST, plain))
     assert float(cross_entropy(COST, padded)) == pytest.approx(expected, rel=1e-14)
     # A weight of 2 is the same as the pair twice.
@@ -157,6 +157,9 @@ def test_a_model_of_ones_own():
     assert isinstance(model, CostModel)
     sizes = 0.5 * np.abs(POOL.x[:, :-1]).sum((-1, -2))
     data = pair_data(model, FEW, 16)
+    # Every trajectory once, however many pairs it is in; padded to few shapes.
+    assert pair_data(model, FEW).features["size"].shape == (5,)
+    assert data.features["size"].shape == (128,)
     z = np.asarray(logits(model, data))[:4]
     np.testing.assert_allclose(z, sizes[FEW.second] - sizes[FEW.first], rtol=1e-12)
 
