@@ -244,6 +244,7 @@ class ICNNCost:
         steps : int, optional
             The network then looks at whole trajectories of so many steps, instead of stages.
         shape : leading shape of the stack.
+        activation, floor, bias : as for the class.
         """
         require_x64()
         size = np.asarray(finite_array("scale", scale, ndim=1))
