@@ -10,6 +10,7 @@ import numpy as np
 import optax
 
 from prefmpc.comparisons import Comparisons
+from prefmpc.trajectories import Trajectory
 
 SMALLEST_SHAPE = 1024
 """Data sets are padded to this many pairs, or to the next power of two above it."""
@@ -22,9 +23,9 @@ class FitError(RuntimeError):
     """No model was learned that may be used."""
 
 
-def padded_size(n: int) -> int:
+def padded_size(n: int, smallest: int = SMALLEST_SHAPE) -> int:
     """Return the shape that ``n`` pairs are padded to, so that few shapes need compiling."""
-    return max(SMALLEST_SHAPE, 1 << (n - 1).bit_length())
+    return max(smallest, 1 << (n - 1).bit_length())
 
 
 class PairData(NamedTuple):
@@ -48,24 +49,27 @@ def pair_data(model: Any, comparisons: Comparisons, size: int | None = None) -> 
     padding = np.zeros(size - n, dtype=int)
     i = np.concatenate([comparisons.first, padding])
     j = np.concatenate([comparisons.second, padding])
-    used, sides = np.unique(np.stack([i, j]), return_inverse=True)
-    if not model.linear_in_features and size > n:
-        used = np.concatenate([used, np.full(_padded_pool(len(used)) - len(used), used[0])])
-    with np.errstate(over="ignore"):  # said in one sentence below
-        features = jax.tree.map(np.asarray, model.features(comparisons.trajectories[used]))
-    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(features)):
-        raise ValueError("trajectories must have finite features, got NaN or an overflow")
     labels = np.concatenate([comparisons.labels, padding])
     weights = np.concatenate([np.ones(n), padding])
-    first, second = sides.reshape(2, size)
     if model.linear_in_features:
-        gap = jax.tree.map(lambda leaf: leaf[second] - leaf[first], features)
+        features = _features(model, comparisons.trajectories)
+        gap = jax.tree.map(lambda leaf: leaf[j] - leaf[i], features)
         return PairData(None, gap, labels, weights)
+    used, sides = np.unique(np.stack([i, j]), return_inverse=True)
+    if size > n:
+        spare = padded_size(len(used), SMALLEST_POOL) - len(used)
+        used = np.concatenate([used, np.full(spare, used[0])])
+    first, second = sides.reshape(2, size)
+    features = _features(model, comparisons.trajectories[used])
     return PairData((first, second), features, labels, weights)
 
 
-def _padded_pool(count: int) -> int:
-    return max(SMALLEST_POOL, 1 << (count - 1).bit_length())
+def _features(model: Any, trajectories: Trajectory) -> Any:
+    with np.errstate(over="ignore"):  # said in one sentence below
+        features = jax.tree.map(np.asarray, model.features(trajectories))
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(features)):
+        raise ValueError("trajectories must have finite features, got NaN or an overflow")
+    return features
 
 
 def logits(model: Any, data: PairData) -> Any:

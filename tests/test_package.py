@@ -118,7 +118,7 @@ LAYERS = {
     "preferences": HELPERS | {"trajectories"},
     "comparisons": HELPERS | {"trajectories", "preferences"},
     "models": HELPERS | {"systems", "sets", "trajectories", "pools"},
-    "losses": HELPERS | {"comparisons"},
+    "losses": HELPERS | {"trajectories", "comparisons"},
     "training": HELPERS | {"_lbfgsb", "trajectories", "models", "comparisons", "losses"},
     "priors": HELPERS,
     "_newton": HELPERS | {"trajectories", "comparisons", "models", "priors"},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,10 +12,10 @@ import scipy.sparse as sp
 
 from prefmpc._checks import instance, nonnegative
 from prefmpc.models import QuadraticCost, SumCost
-from prefmpc.mpc.solution import check_dimension
+from prefmpc.mpc.solution import MPCSolution, check_dimension, infeasible_message, predicted
 from prefmpc.mpc.terminal import stage_constraints
 from prefmpc.networks import ICNNCost
-from prefmpc.sets import Polyhedron, SecondOrderCone
+from prefmpc.sets import SecondOrderCone
 from prefmpc.systems import LinearSystem
 
 # Clarabel calls a point "almost solved" when it gets no further than the reduced tolerances.
@@ -44,6 +45,34 @@ class ConeSolution:
     message: str
     iterations: int
     residual: float
+
+
+def mpc_solution(
+    system: LinearSystem,
+    x0: np.ndarray,
+    states: np.ndarray,
+    inputs: np.ndarray,
+    found: ConeSolution,
+    began: float,
+) -> MPCSolution:
+    """Return the answer of a controller: the plan, or NaN and the reason why there is none."""
+    message, cost = found.message, found.objective
+    if found.status == "infeasible":
+        message = infeasible_message(x0, len(inputs))
+    if found.status != "solved":
+        states, inputs = np.full_like(states, np.nan), np.full_like(inputs, np.nan)
+        cost = np.nan
+    inputs = np.clip(inputs, system.u_min, system.u_max)
+    return MPCSolution(
+        u=inputs[0],
+        trajectory=predicted(system, states, inputs),
+        cost=cost,
+        status=found.status,
+        message=message,
+        iterations=found.iterations,
+        residual=found.residual,
+        seconds=time.perf_counter() - began,
+    )
 
 
 class ConeProgram:
@@ -213,14 +242,11 @@ def stage_limits(
 
     Raises a ValueError if a set does not fit.
     """
-    if constraints is not None:
-        instance("constraints", constraints, Polyhedron)
-        check_dimension("constraints", constraints.dim, system.nx + system.nu)
+    Z = stage_constraints(system, constraints)
     for i, cone in enumerate(output_cones):
         instance(f"output_cones[{i}]", cone, SecondOrderCone)
         check_dimension(f"output_cones[{i}]", cone.dim, system.ny)
     limits = []
-    Z = stage_constraints(system, constraints)
     if len(Z.h):
         limits.append(cp.hstack([X, U]) @ Z.H.T <= np.tile(Z.h, (X.shape[0], 1)))
     Y = X @ system.C.T

@@ -18,7 +18,7 @@ from jax.typing import ArrayLike
 from prefmpc._checks import nonnegative, positive_int
 from prefmpc._pytree import bypass_init
 from prefmpc.models import QuadraticCost
-from prefmpc.mpc.solution import MPCError, MPCSolution, check_problem, check_state
+from prefmpc.mpc.solution import Controller, MPCSolution, check_problem, check_state
 from prefmpc.systems import LinearSystem
 from prefmpc.trajectories import Trajectory
 
@@ -194,7 +194,7 @@ def _solve_many(
     return jax.vmap(one)(costs, x0)
 
 
-class BatchedMPC:
+class BatchedMPC(Controller):
     """The MPC of eq. (12) of arXiv 2511.22502 for whole batches of states, and of costs.
 
     Solves the same problem as `LinearMPC` without ``constraints`` and ``terminal``: only input
@@ -265,13 +265,6 @@ class BatchedMPC:
             residual=distance.reshape(lead),
             seconds=time.perf_counter() - began,
         )
-
-    def __call__(self, x0: ArrayLike) -> np.ndarray:
-        """Return the inputs to apply, (..., nu). Raises an `MPCError` if any solve failed."""
-        solution = self.solve(x0)
-        if not solution.success:
-            raise MPCError(solution)
-        return solution.u
 
 
 def _cost_along(costs: QuadraticCost, trajectory: Trajectory, stacked: bool) -> np.ndarray:

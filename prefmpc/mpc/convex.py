@@ -11,14 +11,12 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import instance, positive_int
 from prefmpc.models import QuadraticCost, SumCost
-from prefmpc.mpc._cone import ParametricProgram, expression, stage_limits
+from prefmpc.mpc._cone import ParametricProgram, expression, mpc_solution, stage_limits
 from prefmpc.mpc.solution import (
-    MPCError,
+    Controller,
     MPCSolution,
     check_dimension,
-    check_state,
-    infeasible_message,
-    predicted,
+    check_single_state,
 )
 from prefmpc.mpc.stability import StabilityCheck
 from prefmpc.mpc.terminal import TerminalIngredients
@@ -27,7 +25,7 @@ from prefmpc.sets import Ellipsoid, Polyhedron, SecondOrderCone
 from prefmpc.systems import LinearSystem
 
 
-class ConvexMPC:
+class ConvexMPC(Controller):
     """The controller min σ(T) s.t. x_0 = x(t), the dynamics, (x_k, u_k) ∈ Z, x_N ∈ X_N.
 
     Implements eq. (7) of arXiv 2511.22502 for a linear plant, convex sets and any convex σ: a
@@ -107,35 +105,7 @@ class ConvexMPC:
 
     def solve(self, x0: ArrayLike) -> MPCSolution:
         """Solve for the state x0 (nx,); see `MPCSolution`. Raises a ValueError on a bad x0."""
-        state = np.asarray(check_state(x0, self.system.nx))
-        if state.ndim != 1:
-            raise ValueError(f"x0 must have shape ({self.system.nx},), got {state.shape}")
+        state = check_single_state(x0, self.system.nx)
         began = time.perf_counter()
         found, (states, inputs) = self._program.solve(state)
-        status, message, cost = found.status, found.message, found.objective
-        if status == "infeasible":
-            message = infeasible_message(state, self.horizon)
-        if status != "solved":
-            states, inputs, cost = (
-                np.full_like(states, np.nan),
-                np.full_like(inputs, np.nan),
-                np.nan,
-            )
-        inputs = np.clip(inputs, self.system.u_min, self.system.u_max)
-        return MPCSolution(
-            u=inputs[0],
-            trajectory=predicted(self.system, states, inputs),
-            cost=cost,
-            status=status,
-            message=message,
-            iterations=found.iterations,
-            residual=found.residual,
-            seconds=time.perf_counter() - began,
-        )
-
-    def __call__(self, x0: ArrayLike) -> np.ndarray:
-        """Return the input to apply, u*_0 (nu,). Raises an `MPCError` if the solve failed."""
-        solution = self.solve(x0)
-        if not solution.success:
-            raise MPCError(solution)
-        return solution.u
+        return mpc_solution(self.system, state, states, inputs, found, began)

@@ -12,15 +12,13 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import instance, positive_int
 from prefmpc.models import QuadraticCost
-from prefmpc.mpc._cone import TIGHT, ConeProgram, ConeSolution
+from prefmpc.mpc._cone import TIGHT, ConeProgram, ConeSolution, mpc_solution
 from prefmpc.mpc.solution import (
-    MPCError,
+    Controller,
     MPCSolution,
     check_dimension,
     check_problem,
-    check_state,
-    infeasible_message,
-    predicted,
+    check_single_state,
 )
 from prefmpc.mpc.terminal import TerminalIngredients
 from prefmpc.sets import Polyhedron
@@ -37,7 +35,7 @@ _SETTINGS = {
 }
 
 
-class LinearMPC:
+class LinearMPC(Controller):
     """The controller min σ(T) s.t. x_0 = x(t), the dynamics, (x_k, u_k) ∈ Z, x_N ∈ X_N.
 
     Implements eq. (7) of arXiv 2511.22502 for a linear plant, polyhedral sets and quadratic σ;
@@ -145,21 +143,12 @@ class LinearMPC:
 
     def solve(self, x0: ArrayLike) -> MPCSolution:
         """Solve for the state x0 (nx,); see `MPCSolution`. Raises a ValueError on a bad x0."""
-        x0 = np.asarray(check_state(x0, self.system.nx))
-        if x0.ndim != 1:
-            raise ValueError(f"x0 must have shape ({self.system.nx},), got {x0.shape}")
+        x0 = check_single_state(x0, self.system.nx)
         began = time.perf_counter()
         self._lower[: x0.size] = self._upper[: x0.size] = -x0
         self._solver.update(l=self._lower, u=self._upper)
         result = self._solver.solve(raise_error=False)
         return self._solution(x0, result, began)
-
-    def __call__(self, x0: ArrayLike) -> np.ndarray:
-        """Return the input to apply, u*_0 (nu,). Raises an `MPCError` if the solve failed."""
-        solution = self.solve(x0)
-        if not solution.success:
-            raise MPCError(solution)
-        return solution.u
 
     def _by_interior_point(self, iterations: int) -> ConeSolution:
         """Solve with Clarabel what OSQP gave up on: problems with hardly any room, as a rule."""
@@ -202,24 +191,12 @@ class LinearMPC:
             iterations=int(result.info.iter),
             residual=max(float(result.info.prim_res), float(result.info.dual_res)),
         )
-        if found.status == "unfinished" or not np.isfinite(found.z).all():
+        finished = found.status == "infeasible" or np.isfinite(found.z).all()
+        if found.status == "unfinished" or not finished:
             found = self._by_interior_point(found.iterations)
-        message = infeasible_message(x0, N) if found.status == "infeasible" else found.message
-        inputs = np.full((N, nu), np.nan)
-        states = np.full((N + 1, nx), np.nan)
-        cost = np.nan
-        if found.status == "solved":
-            states, inputs = np.split(found.z, [nx * (N + 1)])
-            states = states.reshape(N + 1, nx)
-            inputs = np.clip(inputs.reshape(N, nu), self.system.u_min, self.system.u_max)
-            cost = found.objective
-        return MPCSolution(
-            u=inputs[0],
-            trajectory=predicted(self.system, states, inputs),
-            cost=cost,
-            status=found.status,
-            message=message,
-            iterations=found.iterations,
-            residual=found.residual,
-            seconds=time.perf_counter() - began,
+        size = nx * (N + 1) + nu * N
+        plan = found.z if found.status == "solved" else np.full(size, np.nan)
+        states, inputs = plan[: nx * (N + 1)], plan[nx * (N + 1) :]
+        return mpc_solution(
+            self.system, x0, states.reshape(-1, nx), inputs.reshape(-1, nu), found, began
         )

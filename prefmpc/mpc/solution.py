@@ -63,6 +63,21 @@ class MPCSolution:
         return bool(np.all(np.asarray(self.status) == "solved"))
 
 
+class Controller:
+    """What has ``solve(x0) -> MPCSolution`` can be called: u = controller(x)."""
+
+    def solve(self, x0: ArrayLike) -> MPCSolution:
+        """Solve for the state x0."""
+        raise NotImplementedError
+
+    def __call__(self, x0: ArrayLike) -> np.ndarray:
+        """Return the inputs to apply, (..., nu). Raises an `MPCError` if any solve failed."""
+        solution = self.solve(x0)
+        if not solution.success:
+            raise MPCError(solution)
+        return solution.u
+
+
 def check_problem(system: Any, cost: Any) -> None:
     """Raise a ValueError unless ``cost`` is a QuadraticCost that fits the LinearSystem."""
     if not isinstance(system, LinearSystem):
@@ -96,6 +111,14 @@ def infeasible_message(x0: np.ndarray, horizon: int) -> str:
 def check_state(x0: ArrayLike, nx: int) -> Any:
     """Return x0 (..., nx) as a float64 array, or raise a ValueError that names it."""
     return shaped("x0", finite_array("x0", x0), (nx,), "the system's states")
+
+
+def check_single_state(x0: ArrayLike, nx: int) -> np.ndarray:
+    """Return one x0 (nx,) as a float64 array, or raise a ValueError that names it."""
+    state = np.asarray(check_state(x0, nx))
+    if state.ndim != 1:
+        raise ValueError(f"x0 must have shape ({nx},), got {state.shape}")
+    return state
 
 
 def predicted(system: LinearSystem, states: np.ndarray, inputs: np.ndarray) -> Trajectory:

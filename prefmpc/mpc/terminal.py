@@ -37,11 +37,16 @@ class TerminalIngredients:
 
 
 def stage_constraints(system: LinearSystem, constraints: Polyhedron | None) -> Polyhedron:
-    """Return Z over the stacked (x, u): the input bounds, and ``constraints`` if there are some."""
+    """Return Z over the stacked (x, u): the input bounds, and ``constraints`` if there are some.
+
+    Raises a ValueError if these do not fit.
+    """
     box = Polyhedron.box(system.u_min, system.u_max)
     H = np.concatenate([np.zeros((len(box.h), system.nx)), box.H], axis=1)
     if constraints is None:
         return Polyhedron(H, box.h)
+    instance("constraints", constraints, Polyhedron)
+    check_dimension("constraints", constraints.dim, system.nx + system.nu)
     return Polyhedron(np.concatenate([H, constraints.H]), np.concatenate([box.h, constraints.h]))
 
 
@@ -83,9 +88,6 @@ def terminal_ingredients(
     if cost.batch_shape:
         raise ValueError(f"cost must be a single model, got a stack of shape {cost.batch_shape}")
     max_steps, tol = positive_int("max_steps", max_steps), nonnegative("tol", tol)
-    if constraints is not None:
-        instance("constraints", constraints, Polyhedron)
-        check_dimension("constraints", constraints.dim, system.nx + system.nu)
     Z = stage_constraints(system, constraints)
     if (Z.h <= 0).any():
         raise ValueError(

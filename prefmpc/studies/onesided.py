@@ -98,6 +98,11 @@ def with_constant(trajectory: Trajectory) -> Trajectory:
     return Trajectory(np.concatenate([trajectory.x, ones], axis=-1), trajectory.u)
 
 
+def extended(data: Comparisons) -> Comparisons:
+    """Return the same pairs and answers, with the state 1 appended."""
+    return Comparisons(with_constant(data.trajectories), data.first, data.second, data.labels)
+
+
 def constant_system(system: LinearSystem) -> LinearSystem:
     """Return the plant with one more state, which stays as it is."""
     A = scipy.linalg.block_diag(system.A, 1.0)
@@ -107,8 +112,7 @@ def constant_system(system: LinearSystem) -> LinearSystem:
 
 def fit_offset(data: Comparisons) -> QuadraticCost:
     """Learn a quadratic with a centre of its own: σ of (x, 1)."""
-    augmented = Comparisons(with_constant(data.trajectories), data.first, data.second, data.labels)
-    return fit_map(augmented, bryson(np.append(REACH, 0.3), FORCES)).model
+    return fit_map(extended(data), bryson(np.append(REACH, 0.3), FORCES)).model
 
 
 def person_loops(system: LinearSystem, x0: np.ndarray, steps: int) -> Trajectory:
@@ -158,11 +162,8 @@ def onesided_case(
     cost, won = np.zeros((2, len(sizes), len(CONTROLLERS)))
     for i, n in enumerate(sizes):
         models = learn(everything.subset(np.arange(n)), test, key=fits[n])
-        extended = Comparisons(
-            with_constant(test.trajectories), test.first, test.second, test.labels
-        )
         share[i] = [
-            accuracy(model, extended if name == LEARNERS[3] else test)
+            accuracy(model, extended(test) if name == LEARNERS[3] else test)
             for name, model in models.items()
         ]
         values = [*controlled(system, models, LEARNERS[np.argmax(share[i, :3])], x0, steps), known]

@@ -16,6 +16,7 @@ from prefmpc.mpc import LinearMPC, TerminalIngredients, terminal_ingredients
 from prefmpc.pools import lqr_pool, random_states
 from prefmpc.preferences import QuadraticPreference
 from prefmpc.priors import bryson
+from prefmpc.studies.onesided import REACH
 from prefmpc.studies.quadratic import QUADRATIC_Q, QUADRATIC_R, RADIUS
 from prefmpc.systems import LinearSystem, oscillating_masses
 from prefmpc.trajectories import phi
@@ -31,6 +32,10 @@ PENDULUM_RADIUS = np.array([0.2, 0.5])
 PENDULUM_Q, PENDULUM_R = np.diag([1.0, 0.01]), np.diag([10.0])
 """A person who likes gentle torques."""
 PEOPLE = {"pendulum": (PENDULUM_Q, PENDULUM_R), "masses": (QUADRATIC_Q, QUADRATIC_R)}
+RADII = {"pendulum": PENDULUM_RADIUS, "masses": RADIUS}
+"""What x(0) is drawn from, for each plant."""
+DIRECTIONS = {"pendulum": np.ones(2), "masses": REACH}
+"""How far the states go on a ray, in proportion."""
 STILL = 1e-6
 CHECKS = ("largest state", "largest rise", "unsolved", "steps", "accuracy", "naive fails")
 
@@ -54,10 +59,8 @@ def pendulum() -> LinearSystem:
 def learned(plant: str, *, key: Any) -> tuple[LinearSystem, QuadraticCost, float]:
     """Return the plant, a σ from `ANSWERS` answers, and its accuracy on 500 pairs of new loops."""
     rng = generator(key)
-    if plant == "pendulum":
-        system, radius = pendulum(), PENDULUM_RADIUS
-    else:
-        system, radius = oscillating_masses(), RADIUS
+    system = pendulum() if plant == "pendulum" else oscillating_masses()
+    radius = RADII[plant]
     ask = QuadraticPreference(*PEOPLE[plant])
     pools = [lqr_pool(system, size, JUDGED, key=rng, radius=radius) for size in (50, 100)]
     data = Comparisons.random(pools[0], ask, ANSWERS, key=rng)
@@ -113,8 +116,8 @@ def stability_case(
         streams = [*every[2 * place : 2 * place + 2], every[2 * len(PLANTS) + place]]
         system, cost, share = learned(plant, key=streams[0])
         end = terminal_ingredients(system, cost)
-        unit = np.ones(2) if plant == "pendulum" else np.array([0.3, 0.3, 0.3, 1, 1, 1])
-        x0 = feasible_states(system, end, HORIZONS[plant], loops, key=streams[1], unit=unit)
+        options: dict[str, Any] = {"key": streams[1], "unit": DIRECTIONS[plant]}
+        x0 = feasible_states(system, end, HORIZONS[plant], loops, **options)
         cured = LinearMPC(system, cost, HORIZONS[plant], terminal=end)
         outcomes = [follow(cured, x, limit) for x in x0]
         final, rise, unsolved, steps = np.array(outcomes).T
@@ -146,9 +149,8 @@ def ingredients_regret(
     weights and looks ahead as far. States are those that people judge, cut down to where the
     ingredients leave a plan.
     """
-    radius = PENDULUM_RADIUS if plant == "pendulum" else RADIUS
     cured = LinearMPC(system, cost, REGRET_HORIZON, terminal=end)
-    x0 = random_states(radius, key=key, shape=(loops,))
+    x0 = random_states(RADII[plant], key=key, shape=(loops,))
     x0 = x0[[cured.solve(x).success for x in x0]]
     person = QuadraticCost(*PEOPLE[plant])
     best = closed_loops(system, person, x0, horizon=REGRET_STEPS, steps=REGRET_STEPS)
