@@ -7,6 +7,7 @@ objective of the controller.
 
 from prefmpc.comparisons import Comparisons
 from prefmpc.convex import Interval, MapResult, fit_map, fit_maps
+from prefmpc.early_stopping import NetworkFit, fit_network
 from prefmpc.evaluation import (
     ClosedLoops,
     WinRate,
@@ -18,6 +19,7 @@ from prefmpc.evaluation import (
 )
 from prefmpc.global_fit import GlobalResult, fit_global
 from prefmpc.losses import FitError
+from prefmpc.mlp import MLPCost
 from prefmpc.models import CostModel, QuadraticCost, SumCost
 from prefmpc.mpc import (
     BatchedMPC,
@@ -25,12 +27,18 @@ from prefmpc.mpc import (
     LinearMPC,
     MPCError,
     MPCSolution,
+    NonlinearMPC,
+    ReferenceTracker,
     StabilityCheck,
+    SteadyState,
     TerminalIngredients,
     check_stability,
+    steady_state,
     terminal_ingredients,
 )
 from prefmpc.networks import ICNNCost, soft_constraints
+from prefmpc.nonlinear import NonlinearSystem
+from prefmpc.plants import cart_pendulum, kinematic_bicycle
 from prefmpc.pools import lqr_pool, random_states, random_weights
 from prefmpc.preferences import (
     Criterion,
@@ -46,6 +54,7 @@ from prefmpc.preferences import (
 from prefmpc.priors import WishartPrior, blocks, bryson
 from prefmpc.selection import PriorChoice, choose_prior
 from prefmpc.sets import Ellipsoid, Polyhedron, SecondOrderCone
+from prefmpc.signals import SignalCost, select
 from prefmpc.systems import LinearSystem, oscillating_masses
 from prefmpc.training import FitResult, fit
 from prefmpc.trajectories import (
@@ -77,19 +86,26 @@ __all__ = [
     "Interval",
     "LinearMPC",
     "LinearSystem",
+    "MLPCost",
     "MPCError",
     "MPCSolution",
     "MapResult",
     "Moments",
+    "NetworkFit",
+    "NonlinearMPC",
+    "NonlinearSystem",
     "Polyhedron",
     "Posterior",
     "Preference",
     "PriorChoice",
     "QuadraticCost",
     "QuadraticPreference",
+    "ReferenceTracker",
     "SecondOrderCone",
     "SettlingTimePreference",
+    "SignalCost",
     "StabilityCheck",
+    "SteadyState",
     "SumCost",
     "TerminalIngredients",
     "Trajectory",
@@ -99,6 +115,7 @@ __all__ = [
     "blocks",
     "bryson",
     "by_criterion",
+    "cart_pendulum",
     "check_stability",
     "choose_prior",
     "closed_loops",
@@ -107,6 +124,8 @@ __all__ = [
     "fit_global",
     "fit_map",
     "fit_maps",
+    "fit_network",
+    "kinematic_bicycle",
     "lexicographic",
     "logistic",
     "lqr_pool",
@@ -120,10 +139,12 @@ __all__ = [
     "regret",
     "rollout",
     "second_moments",
+    "select",
     "settling_text",
     "settling_time",
     "simulate",
     "soft_constraints",
+    "steady_state",
     "terminal_ingredients",
     "win_rate",
 ]

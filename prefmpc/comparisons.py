@@ -17,7 +17,8 @@ from prefmpc._random import generator
 from prefmpc.preferences import Preference
 from prefmpc.trajectories import Trajectory
 
-_FORMAT_VERSION = 1
+_FORMAT_VERSIONS = (1, 2)  # (x, u, y) alone, and with what is optional
+_OPTIONAL = ("x_r", "u_r", "y_r", "u_before")
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
@@ -188,16 +189,7 @@ class Comparisons:
         handle, temporary = tempfile.mkstemp(dir=target.parent, suffix=".npz.part")
         try:
             with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(
-                    file,
-                    format_version=np.asarray(_FORMAT_VERSION),
-                    x=np.asarray(self.trajectories.x),
-                    u=np.asarray(self.trajectories.u),
-                    y=np.asarray(self.trajectories.y),
-                    first=self.first,
-                    second=self.second,
-                    labels=self.labels,
-                )
+                np.savez_compressed(file, **self._stored())
                 file.flush()
                 os.fsync(file.fileno())
             # mkstemp makes the file private; a data set gets the permissions of any new file.
@@ -209,6 +201,17 @@ class Comparisons:
             Path(temporary).unlink(missing_ok=True)
             raise
         return target
+
+    def _stored(self) -> dict[str, Any]:
+        T = self.trajectories
+        arrays = {"x": T.x, "u": T.u, "y": T.y}
+        optional = {name: getattr(T, name) for name in _OPTIONAL}
+        optional = {name: value for name, value in optional.items() if value is not None}
+        pairs = {"first": self.first, "second": self.second, "labels": self.labels}
+        # A reader that does not know set points must refuse them, not lose them.
+        version = _FORMAT_VERSIONS[bool(optional)]
+        stored = {"format_version": version, **arrays, **optional, **pairs}
+        return {name: np.asarray(value) for name, value in stored.items()}
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Comparisons:
@@ -224,11 +227,12 @@ class Comparisons:
         if missing := sorted(wanted - stored.keys()):
             raise ValueError(f"path must be a file of saved comparisons, {path} lacks {missing}")
         version = stored["format_version"]
-        if version.shape != () or version != _FORMAT_VERSION:
+        if version.shape != () or version not in _FORMAT_VERSIONS:
             raise ValueError(
-                f"path must hold format version {_FORMAT_VERSION}, got {version} in {path}"
+                f"path must hold format version {_FORMAT_VERSIONS}, got {version} in {path}"
             )
-        trajectories = Trajectory(stored["x"], stored["u"], stored["y"])
+        optional = {name: stored[name] for name in _OPTIONAL if name in stored}
+        trajectories = Trajectory(stored["x"], stored["u"], stored["y"], **optional)
         return cls(trajectories, stored["first"], stored["second"], stored["labels"])
 
 

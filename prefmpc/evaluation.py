@@ -17,9 +17,9 @@ from prefmpc._checks import function, instance, nonnegative, positive_int, to_nu
 from prefmpc.comparisons import Comparisons
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc.batched import broadcast_states, condense, each_cost, solve_box
-from prefmpc.mpc.solution import check_problem, check_state
+from prefmpc.mpc.solution import Controller, check_problem, check_state
 from prefmpc.preferences import Preference
-from prefmpc.systems import LinearSystem
+from prefmpc.systems import LinearSystem, System
 from prefmpc.trajectories import Trajectory, from_flat
 
 
@@ -170,7 +170,7 @@ def _same_starts(name: str, trajectory: Trajectory, other: Trajectory) -> None:
 
 
 def simulate(
-    system: LinearSystem, controller: Callable[[Any], ArrayLike], x0: ArrayLike, steps: int
+    system: System, controller: Callable[[Any], ArrayLike], x0: ArrayLike, steps: int
 ) -> Trajectory:
     """Run plant and controller in closed loop: u(t) = controller(x(t)).
 
@@ -190,11 +190,12 @@ def simulate(
     Raises
     ------
     ValueError
-        If x0 or an input that the controller returns is not finite or has a wrong shape.
+        If x0, an input that the controller returns, or a state that the plant reaches is not
+        finite, or has a wrong shape.
     MPCError
         If an MPC controller finds no solution on the way.
     """
-    instance("system", system, LinearSystem)
+    instance("system", system, System)
     function("controller", controller)
     x0 = np.asarray(check_state(x0, system.nx))
     steps = positive_int("steps", steps)
@@ -203,6 +204,8 @@ def simulate(
     u = np.empty((len(starts), steps, system.nu))
     x[:, 0] = starts
     for i in range(len(starts)):
+        if isinstance(controller, Controller):
+            controller.reset()  # nothing is carried over from one loop to the next
         for k in range(steps):
             action = np.asarray(controller(x[i, k]), dtype=np.float64)
             if action.shape != (system.nu,) or not np.isfinite(action).all():
@@ -211,7 +214,12 @@ def simulate(
                     f"got {action} at step {k}"
                 )
             u[i, k] = action
-            x[i, k + 1] = system.A @ x[i, k] + system.B @ action
+            x[i, k + 1] = system.step(x[i, k], action)
+            if not np.isfinite(x[i, k + 1]).all():
+                raise ValueError(
+                    f"system must return finite states, got {x[i, k + 1]} at step {k + 1} "
+                    f"from x = {x[i, k]}, u = {action}"
+                )
     return from_flat(system, x, u, x0.shape[:-1])
 
 

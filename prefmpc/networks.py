@@ -1,4 +1,4 @@
-"""σ models that are networks."""
+"""Input-convex networks as σ, and the soft constraints that are one of them."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -18,19 +17,17 @@ from prefmpc._checks import (
     nonnegative,
     positive_int,
     require_x64,
-    shaped,
 )
-from prefmpc._pytree import bypass_init, check_index, register_pytree
+from prefmpc._network import ACTIVATIONS, Over, StageNetwork, check_columns, check_scale
+from prefmpc._pytree import bypass_init, register_pytree
 from prefmpc._random import generator
 from prefmpc.sets import Polyhedron
-from prefmpc.trajectories import Trajectory
 
 Activation = Literal["softplus", "relu", "squared_relu"]
-Over = Literal["stage", "trajectory"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
-class ICNNCost:
+class ICNNCost(StageNetwork):
     """An input-convex network as σ: a convex function of the trajectory, whatever its weights.
 
     With v = (x_k, u_k) / scale, summed over the stages k = 0 … N−1 (``over="stage"``), or
@@ -79,8 +76,6 @@ class ICNNCost:
     over: Over
     bias: bool
 
-    linear_in_features = False
-
     def __init__(
         self,
         V: Sequence[ArrayLike],
@@ -98,11 +93,7 @@ class ICNNCost:
             raise ValueError(
                 f"activation must be one of {get_args(Activation)}, got {activation!r}"
             )
-        if over not in ("stage", "trajectory"):
-            raise ValueError(f'over must be "stage" or "trajectory", got {over!r}')
-        size = np.asarray(finite_array("scale", scale, ndim=1))
-        if size.size == 0 or (size <= 0).any():
-            raise ValueError(f"scale must hold positive numbers, got {size}")
+        size = check_scale(scale, over)
         if not len(V) == len(b) == len(U) + 1 >= 1:
             raise ValueError(
                 "V, b and U must hold L, L and L − 1 layers with L ≥ 1, "
@@ -135,11 +126,7 @@ class ICNNCost:
                     raise ValueError(
                         f"{label} must not be negative, else σ is not convex; got {array.min():.3g}"
                     )
-        if (n_v != size.size) if over == "stage" else (n_v % size.size or n_v == 0):
-            raise ValueError(
-                f"V must have {'a multiple of ' if over == 'trajectory' else ''}{size.size} "
-                f"columns, the entries of v, got {n_v}"
-            )
+        check_columns("V", n_v, size.size, over)
         values: dict[str, Any] = {
             "V": tuple(layers["V"]),
             "b": tuple(layers["b"]),
@@ -155,55 +142,12 @@ class ICNNCost:
             object.__setattr__(self, name, value)
 
     @property
-    def batch_shape(self) -> tuple[int, ...]:
-        """Leading shape of a stack of models; () for one."""
-        return tuple(self.c.shape[:-1])
-
-    def __getitem__(self, index: Any) -> ICNNCost:
-        """Index the leading dimensions of a stack of models."""
-        if not self.batch_shape:
-            raise IndexError("a single ICNNCost has no batch dimension to index")
-        check_index(index, self.batch_shape[0])
-        return jax.tree.map(lambda leaf: leaf[index], self)
-
-    def __call__(self, trajectory: Trajectory) -> Any:
-        """Return σ(T) for every trajectory of a batch, shape (...). For a single model."""
-        instance("trajectory", trajectory, Trajectory)
-        if self.batch_shape:
-            raise ValueError(f"the model must be a single one, got a stack {self.batch_shape}")
-        nx, nu = trajectory.x.shape[-1], trajectory.u.shape[-1]
-        if nx + nu != len(self.scale):
-            raise ValueError(
-                f"trajectory must have {len(self.scale)} states and inputs, got {nx} and {nu}"
-            )
-        features = self.features(trajectory)
-        if self.over == "trajectory":
-            n_v = self.V[0].shape[-1]
-            steps = n_v // len(self.scale)
-            shaped("trajectory.u", trajectory.u, (steps, nu), "as many steps as the model has")
-        return (
-            np.asarray(_score(self, features)) if _plain(features, self) else self.score(features)
-        )
-
-    @staticmethod
-    def features(trajectory: Trajectory) -> Any:
-        """Return the stages (x_k, u_k), shape (..., N, nx + nu)."""
-        xp = np if _plain(trajectory) else jnp
-        return xp.concatenate([trajectory.x[..., :-1, :], trajectory.u], axis=-1)
-
-    def score(self, features: Any) -> Any:
-        """Return σ (...) from stages (..., N, nx + nu)."""
-        v = features / np.asarray(self.scale)
-        if self.over == "trajectory":
-            return self._network(v.reshape(*v.shape[:-2], -1))
-        return self._network(v).sum(-1)
+    def columns(self) -> int:
+        """Number of entries of v."""
+        return int(self.V[0].shape[-1])
 
     def _network(self, v: Any) -> Any:
-        act = {
-            "softplus": jax.nn.softplus,
-            "relu": jax.nn.relu,
-            "squared_relu": lambda a: jax.nn.relu(a) ** 2,
-        }[self.activation]
+        act = ACTIVATIONS[self.activation]
         z = act(v @ self.V[0].T + self.b[0])
         for V, b, U in zip(self.V[1:], self.b[1:], self.U, strict=True):
             z = act(z @ U.T + v @ V.T + b)
@@ -297,12 +241,3 @@ register_pytree(ICNNCost, static=("scale", "activation", "floor", "over", "bias"
 
 def _fields(model: ICNNCost) -> dict[str, Any]:
     return {field.name: getattr(model, field.name) for field in dataclasses.fields(model)}
-
-
-def _plain(*trees: Any) -> bool:
-    return all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(trees))
-
-
-@jax.jit
-def _score(model: ICNNCost, features: Any) -> Any:
-    return model.score(features)

@@ -1,4 +1,4 @@
-"""Plants: discrete-time linear systems with input bounds, and the book's benchmark plant."""
+"""Plants: what all have in common, linear ones, and the book's benchmark plant."""
 
 from __future__ import annotations
 
@@ -17,8 +17,27 @@ if TYPE_CHECKING:
     import control
 
 
+class System:
+    """A discrete-time plant x⁺ = f(x, u), y = g(x) with input bounds; see its two kinds."""
+
+    nx: int
+    nu: int
+    ny: int
+    dt: float
+    u_min: np.ndarray
+    u_max: np.ndarray
+
+    def step(self, x: Any, u: Any) -> Any:
+        """Return the next state (..., nx) for x (..., nx) and u (..., nu)."""
+        raise NotImplementedError
+
+    def output(self, x: Any) -> Any:
+        """Return the output (..., ny) for x (..., nx)."""
+        raise NotImplementedError
+
+
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
-class LinearSystem:
+class LinearSystem(System):
     """The discrete-time plant x⁺ = A x + B u, y = C x with u_min ≤ u ≤ u_max.
 
     Implements eq. (8) of arXiv 2511.22502.
@@ -65,18 +84,26 @@ class LinearSystem:
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
+    def step(self, x: Any, u: Any) -> Any:
+        """Return x⁺ = A x + B u, shape (..., nx)."""
+        return x @ self.A.T + u @ self.B.T
+
+    def output(self, x: Any) -> Any:
+        """Return y = C x, shape (..., ny)."""
+        return x @ self.C.T
+
     @property
-    def nx(self) -> int:
+    def nx(self) -> int:  # type: ignore[override]
         """Number of states."""
         return int(self.A.shape[-1])
 
     @property
-    def nu(self) -> int:
+    def nu(self) -> int:  # type: ignore[override]
         """Number of inputs."""
         return int(self.B.shape[-1])
 
     @property
-    def ny(self) -> int:
+    def ny(self) -> int:  # type: ignore[override]
         """Number of outputs."""
         return int(self.C.shape[-2])
 

@@ -290,6 +290,11 @@ def _starts(
         nx, nu = trajectories.x.shape[-1], trajectories.u.shape[-1]
         restarts = positive_int("restarts", restarts)
         return QuadraticCost.random(nx, nu, key=key, shape=(restarts,))
+    return check_starts(comparisons, initial)
+
+
+def check_starts(comparisons: Comparisons, initial: Any) -> CostModel:
+    """Return the starts, stacked along one leading axis, or raise a ValueError."""
     if isinstance(initial, QuadraticCost) and not initial.batch_shape:
         initial = jax.tree.map(lambda leaf: leaf[None], initial)
     if not isinstance(initial, CostModel):
@@ -298,7 +303,7 @@ def _starts(
     if len(sizes) != 1 or not all(sizes):
         raise ValueError(f"initial must be stacked along one leading axis, got {sorted(sizes)}")
     one = jax.tree.map(lambda leaf: leaf[0], initial)
-    one(trajectories)  # raises a ValueError if the model and the trajectories do not fit
+    one(comparisons.trajectories)  # raises a ValueError if the two do not fit
     return initial
 
 

@@ -15,6 +15,7 @@ from prefmpc._checks import (
     array_module,
     finite_array,
     instance,
+    is_traced,
     nonnegative,
     positive_int,
     psd_matrix,
@@ -22,7 +23,7 @@ from prefmpc._checks import (
     to_numpy,
 )
 from prefmpc._pytree import bypass_init, check_index, register_pytree
-from prefmpc.systems import LinearSystem
+from prefmpc.systems import LinearSystem, System
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
@@ -39,6 +40,11 @@ class Trajectory:
         Inputs.
     y : array (..., N, ny), optional
         Outputs. Default: the states x_0 … x_{N−1}.
+    x_r, u_r, y_r : array (nx,), (nu,), (ny,) or (..., nx), (..., nu), (..., ny), optional
+        The set point that the trajectory was meant to reach, one for all or one for each; give x_r
+        and u_r together. Default of y_r: x_r where the outputs are the states.
+    u_before : array (nu,) or (..., nu), optional
+        The input that was applied before u_0; without it the first increment Δu_0 counts as 0.
 
     Raises
     ------
@@ -49,8 +55,22 @@ class Trajectory:
     x: Any
     u: Any
     y: Any
+    x_r: Any = None
+    u_r: Any = None
+    y_r: Any = None
+    u_before: Any = None
 
-    def __init__(self, x: ArrayLike, u: ArrayLike, y: ArrayLike | None = None) -> None:
+    def __init__(
+        self,
+        x: ArrayLike,
+        u: ArrayLike,
+        y: ArrayLike | None = None,
+        *,
+        x_r: ArrayLike | None = None,
+        u_r: ArrayLike | None = None,
+        y_r: ArrayLike | None = None,
+        u_before: ArrayLike | None = None,
+    ) -> None:
         states = shaped("x", finite_array("x", x), (None, None), "time, then states")
         inputs = shaped("u", finite_array("u", u), (None, None), "time, then inputs")
         horizon = inputs.shape[-2]
@@ -69,8 +89,31 @@ class Trajectory:
                 "x, u and y must have the same leading batch shape, "
                 f"got {batches[0]}, {batches[1]} and {batches[2]}"
             )
-        for name, value in {"x": states, "u": inputs, "y": outputs}.items():
+        values = {"x": states, "u": inputs, "y": outputs}
+        if (x_r is None) != (u_r is None):
+            raise ValueError("x_r and u_r must be given together, got one of them")
+        if y_r is None and y is None:
+            y_r = x_r
+        elif x_r is None and y_r is not None:
+            raise ValueError("y_r must be given together with x_r and u_r, got y_r alone")
+        for name, value in {"x_r": x_r, "u_r": u_r, "y_r": y_r, "u_before": u_before}.items():
+            if value is not None:
+                values[name] = _reference(name, value, values[name[0]])
+        for name, value in values.items():
             object.__setattr__(self, name, value)
+
+    def deviation(self) -> Trajectory:
+        """Return the same trajectory as deviations from its set point, which is then zero.
+
+        Outputs stay as they are if there is no y_r. A trajectory without a set point is returned
+        unchanged.
+        """
+        if self.x_r is None:
+            return self
+        y = self.y if self.y_r is None else self.y - self.y_r[..., None, :]
+        x, u = self.x - self.x_r[..., None, :], self.u - self.u_r[..., None, :]
+        before = None if self.u_before is None else self.u_before - self.u_r
+        return bypass_init(Trajectory, x=x, u=u, y=y, u_before=before)
 
     @property
     def horizon(self) -> int:
@@ -99,6 +142,14 @@ class Trajectory:
 register_pytree(Trajectory)
 
 
+def _reference(name: str, value: ArrayLike, signal: Any) -> Any:
+    wanted = (*signal.shape[:-2], signal.shape[-1])
+    array = finite_array(name, value)
+    if array.shape not in (wanted, wanted[-1:]):
+        raise ValueError(f"{name} must have shape {wanted[-1:]} or {wanted}, got {array.shape}")
+    return array_module(array).broadcast_to(array, wanted)
+
+
 class Moments(NamedTuple):
     """Second moments S_x = Σ_k x_k x_kᵀ (..., nx, nx) and S_u = Σ_k u_k u_kᵀ (..., nu, nu)."""
 
@@ -110,9 +161,10 @@ def second_moments(trajectory: Trajectory) -> Moments:
     """Return Σ_k x_k x_kᵀ and Σ_k u_k u_kᵀ over k = 0 … N−1.
 
     All that a quadratic cost can see of a trajectory: φ_N = ⟨Q, S_x⟩ + ⟨R, S_u⟩. The final state
-    x_N is left out, as in eq. (10) of arXiv 2511.22502.
+    x_N is left out, as in eq. (10) of arXiv 2511.22502. With a set point: of the deviations.
     """
     instance("trajectory", trajectory, Trajectory)
+    trajectory = trajectory.deviation()
     x = trajectory.x[..., :-1, :]
     u = trajectory.u
     return Moments(x.swapaxes(-1, -2) @ x, u.swapaxes(-1, -2) @ u)
@@ -121,10 +173,11 @@ def second_moments(trajectory: Trajectory) -> Moments:
 def phi(trajectory: Trajectory, Q: ArrayLike, R: ArrayLike) -> Any:
     """Return φ_N(T; Q, R) = Σ_{k=0}^{N−1} x_kᵀ Q x_k + u_kᵀ R u_k, shape (...).
 
-    Implements eq. (10) of arXiv 2511.22502. Q (nx, nx) and R (nu, nu) must be positive
-    semidefinite; anything else raises a ValueError.
+    Implements eq. (10) of arXiv 2511.22502; with a set point, of the deviations from it.
+    Q (nx, nx) and R (nu, nu) must be positive semidefinite; anything else raises a ValueError.
     """
     instance("trajectory", trajectory, Trajectory)
+    trajectory = trajectory.deviation()
     Q, R = psd_matrix("Q", Q), psd_matrix("R", R)
     shaped("Q", Q, (trajectory.x.shape[-1],) * 2, "the trajectory's states")
     shaped("R", R, (trajectory.u.shape[-1],) * 2, "the trajectory's inputs")
@@ -174,7 +227,7 @@ def settling_text(kappa: ArrayLike, steps: int) -> str:
 
 
 def rollout(
-    system: LinearSystem,
+    system: System,
     x0: ArrayLike,
     law: Callable[[Any], Any] | ArrayLike,
     steps: int,
@@ -199,54 +252,65 @@ def rollout(
     Raises
     ------
     ValueError
-        If x0 holds NaN, a shape does not fit, or ``steps`` is below 1.
+        If x0 holds NaN, a shape does not fit, ``steps`` is below 1, or a nonlinear plant leaves
+        the numbers.
     """
-    instance("system", system, LinearSystem)
+    instance("system", system, System)
     starts = shaped("x0", finite_array("x0", x0), (system.nx,), "the system's states")
     steps = positive_int("steps", steps)
     batch = starts.shape[:-1]
     flat = starts.reshape(-1, system.nx)
     if callable(law):
-        x, u = _rollout_law(system.A, system.B, flat, steps, law)
+        x, u = _rollout_law(system, flat, steps, law)
     else:
         K = shaped("law", finite_array("law", law), (system.nu, system.nx), "a gain K")
         if K.shape[:-2] not in ((), batch):
             raise ValueError(f"law must hold one gain or one for each x0 {batch}, got {K.shape}")
         gains = array_module(K).broadcast_to(K, (*batch, system.nu, system.nx))
-        x, u = _rollout_gain(
-            system.A, system.B, flat, steps, gains.reshape(-1, system.nu, system.nx)
-        )
+        x, u = _rollout_gain(system, flat, steps, gains.reshape(-1, system.nu, system.nx))
     x, u = to_numpy((x, u))
+    if not isinstance(system, LinearSystem) and not is_traced(x):
+        check_finite_states(x)
     return from_flat(system, x, u, batch)
 
 
-def from_flat(system: LinearSystem, x: Any, u: Any, batch: tuple[int, ...]) -> Trajectory:
+def check_finite_states(x: np.ndarray) -> None:
+    """Raise a ValueError if the states (m, steps + 1, nx) of a simulation stop being numbers."""
+    bad = ~np.isfinite(x).all(axis=-1)
+    if bad.any():
+        run, step = (int(i) for i in np.argwhere(bad)[0])
+        raise ValueError(
+            f"system must return finite states, got {x[run, step]} at step {step} of run {run}"
+        )
+
+
+def from_flat(system: System, x: Any, u: Any, batch: tuple[int, ...]) -> Trajectory:
     """Build a trajectory from x and u with one leading dimension: give it the shape ``batch``.
 
-    The outputs are y = C x. Nothing is checked: a failed solve may have left NaN behind.
+    The outputs are those of the plant. Nothing is checked: a failed solve may have left NaN behind.
     """
     x = x.reshape(*batch, *x.shape[1:])
     u = u.reshape(*batch, *u.shape[1:])
-    return bypass_init(Trajectory, x=x, u=u, y=x[..., :-1, :] @ system.C.T)
+    return bypass_init(Trajectory, x=x, u=u, y=system.output(x[..., :-1, :]))
 
 
-def _scan(A: Any, B: Any, x0: Any, steps: int, law: Callable[[Any], Any]) -> tuple[Any, Any]:
+def _scan(system: System, x0: Any, steps: int, law: Callable[[Any], Any]) -> tuple[Any, Any]:
     def step(x: Any, _: None) -> tuple[Any, tuple[Any, Any]]:
         u = law(x)
-        if jnp.shape(u) != (B.shape[1],):
-            raise ValueError(f"law must return shape ({B.shape[1]},), got {jnp.shape(u)}")
-        x_next = A @ x + B @ u
+        if jnp.shape(u) != (system.nu,):
+            raise ValueError(f"law must return shape ({system.nu},), got {jnp.shape(u)}")
+        x_next = system.step(x, u)
         return x_next, (x_next, u)
 
     _, (x, u) = jax.lax.scan(step, x0, None, length=steps)
     return jnp.concatenate([x0[None], x]), u
 
 
-@jax.jit(static_argnums=(3, 4))
-def _rollout_law(A: Any, B: Any, x0: Any, steps: int, law: Callable[[Any], Any]) -> Any:
-    return jax.vmap(lambda start: _scan(A, B, start, steps, law))(x0)
+@jax.jit(static_argnums=(2, 3))
+def _rollout_law(system: System, x0: Any, steps: int, law: Callable[[Any], Any]) -> Any:
+    return jax.vmap(lambda start: _scan(system, start, steps, law))(x0)
 
 
-@jax.jit(static_argnums=3)
-def _rollout_gain(A: Any, B: Any, x0: Any, steps: int, K: Any) -> Any:
-    return jax.vmap(lambda start, gain: _scan(A, B, start, steps, lambda x: -gain @ x))(x0, K)
+@jax.jit(static_argnums=2)
+def _rollout_gain(system: System, x0: Any, steps: int, K: Any) -> Any:
+    return jax.vmap(lambda start, gain: _scan(system, start, steps, lambda x: -gain @ x))(x0, K)

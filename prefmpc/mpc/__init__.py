@@ -2,10 +2,13 @@
 
 from prefmpc.mpc.batched import BatchedMPC
 from prefmpc.mpc.convex import ConvexMPC
+from prefmpc.mpc.nonlinear import NonlinearMPC
 from prefmpc.mpc.qp import LinearMPC
 from prefmpc.mpc.solution import MPCError, MPCSolution
 from prefmpc.mpc.stability import StabilityCheck, check_stability
+from prefmpc.mpc.steady import SteadyState, steady_state
 from prefmpc.mpc.terminal import TerminalIngredients, terminal_ingredients
+from prefmpc.mpc.tracking import ReferenceTracker
 
 __all__ = [
     "BatchedMPC",
@@ -13,8 +16,12 @@ __all__ = [
     "LinearMPC",
     "MPCError",
     "MPCSolution",
+    "NonlinearMPC",
+    "ReferenceTracker",
     "StabilityCheck",
+    "SteadyState",
     "TerminalIngredients",
     "check_stability",
+    "steady_state",
     "terminal_ingredients",
 ]

@@ -20,6 +20,7 @@ from prefmpc.mpc.solution import (
     check_problem,
     check_single_state,
 )
+from prefmpc.mpc.steady import SteadyState, check_reference, with_reference
 from prefmpc.mpc.terminal import TerminalIngredients
 from prefmpc.sets import Polyhedron
 from prefmpc.systems import LinearSystem
@@ -81,6 +82,7 @@ class LinearMPC(Controller):
         self.cost = cost
         self.horizon = positive_int("horizon", horizon)
         final = np.zeros((system.nx, system.nx))
+        self._ingredients = isinstance(terminal, TerminalIngredients)
         if isinstance(terminal, TerminalIngredients):
             final, terminal = terminal.P, terminal.polyhedron
         for name, given, dim in (
@@ -92,6 +94,7 @@ class LinearMPC(Controller):
             instance(name, given, Polyhedron)
             check_dimension(name, given.dim, dim)
         check_dimension("terminal", len(final), system.nx)
+        self._constraints = constraints
         self._build(constraints, terminal, final)
 
     def _build(
@@ -128,7 +131,8 @@ class LinearMPC(Controller):
             lower.append(np.full(len(terminal.h), -np.inf))
             upper.append(terminal.h)
         self._rows = sp.vstack(rows, format="csc")
-        self._lower, self._upper = np.concatenate(lower), np.concatenate(upper)
+        self._open = np.concatenate(lower), np.concatenate(upper)
+        self._lower, self._upper = self._open
         self._P = sp.triu(P, format="csc")
         self._backup: ConeProgram | None = None
         self._solver = osqp.OSQP()
@@ -141,23 +145,37 @@ class LinearMPC(Controller):
             **_SETTINGS,
         )
 
-    def solve(self, x0: ArrayLike) -> MPCSolution:
-        """Solve for the state x0 (nx,); see `MPCSolution`. Raises a ValueError on a bad x0."""
+    def solve(self, x0: ArrayLike, *, reference: SteadyState | None = None) -> MPCSolution:
+        """Solve for the state x0 (nx,); see `MPCSolution`. Raises a ValueError on a bad x0.
+
+        With a ``reference`` σ sees deviations from it; the sets stay where they are.
+        """
         x0 = check_single_state(x0, self.system.nx)
         began = time.perf_counter()
+        self._lower, self._upper = (bound.copy() for bound in self._open)
         self._lower[: x0.size] = self._upper[: x0.size] = -x0
+        self._origin = np.zeros(self._rows.shape[1])
+        if reference is not None:
+            check_reference(reference, self.system, self._constraints, self._ingredients)
+            N = self.horizon
+            self._origin = np.concatenate([np.tile(reference.x, N + 1), np.tile(reference.u, N)])
+            # Unknown are the deviations: what they leave of every limit.
+            shift = self._rows @ self._origin
+            self._lower, self._upper = self._lower - shift, self._upper - shift
         self._solver.update(l=self._lower, u=self._upper)
         result = self._solver.solve(raise_error=False)
-        return self._solution(x0, result, began)
+        solution = self._solution(x0, result, began)
+        return solution if reference is None else with_reference(solution, reference)
 
     def _by_interior_point(self, iterations: int) -> ConeSolution:
         """Solve with Clarabel what OSQP gave up on: problems with hardly any room, as a rule."""
         import clarabel
 
         if self._backup is None:
-            same = self._lower == self._upper
+            same = self._open[0] == self._open[1]
             # A z = b, then A z ≤ upper, then −A z ≤ −lower, where these are finite.
-            self._split = same, ~same & np.isfinite(self._upper), ~same & np.isfinite(self._lower)
+            low, high = (np.isfinite(bound) for bound in self._open)
+            self._split = same, ~same & high, ~same & low
             equal, above, below = (self._rows.tocsr()[part] for part in self._split)
             rows = sp.vstack([equal, above, -below])
             cones = [
@@ -195,7 +213,8 @@ class LinearMPC(Controller):
         if found.status == "unfinished" or not finished:
             found = self._by_interior_point(found.iterations)
         size = nx * (N + 1) + nu * N
-        plan = found.z if found.status == "solved" else np.full(size, np.nan)
+        solved = found.status == "solved"
+        plan = found.z + self._origin if solved else np.full(size, np.nan)
         states, inputs = plan[: nx * (N + 1)], plan[nx * (N + 1) :]
         return mpc_solution(
             self.system, x0, states.reshape(-1, nx), inputs.reshape(-1, nu), found, began

@@ -43,7 +43,8 @@ class MPCSolution:
     residual : float, or array (...)
         How far from optimal: for `LinearMPC` the larger of the primal and dual residual, for
         `ConvexMPC` the largest of these and the relative duality gap, for `BatchedMPC` a proven
-        bound on the distance of the inputs from the optimal ones.
+        bound on the distance of the inputs from the optimal ones, for `NonlinearMPC` the part of
+        ∇σ that no active constraint balances, relative to 1 + ‖∇σ‖∞.
     seconds : float
         Wall time of the solve.
     """
@@ -70,11 +71,18 @@ class Controller:
         """Solve for the state x0."""
         raise NotImplementedError
 
+    def reset(self) -> None:
+        """Forget what earlier solves left behind, such as a plan to start from."""
+
+    def applied(self, u: np.ndarray) -> None:
+        """Take note of an input that the plant received."""
+
     def __call__(self, x0: ArrayLike) -> np.ndarray:
         """Return the inputs to apply, (..., nu). Raises an `MPCError` if any solve failed."""
         solution = self.solve(x0)
         if not solution.success:
             raise MPCError(solution)
+        self.applied(solution.u)
         return solution.u
 
 

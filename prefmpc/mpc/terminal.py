@@ -11,7 +11,7 @@ from prefmpc._checks import instance, nonnegative, positive_int
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc.solution import check_dimension, check_problem
 from prefmpc.sets import Ellipsoid, Polyhedron
-from prefmpc.systems import LinearSystem
+from prefmpc.systems import LinearSystem, System
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -36,7 +36,7 @@ class TerminalIngredients:
     ellipsoid: Ellipsoid
 
 
-def stage_constraints(system: LinearSystem, constraints: Polyhedron | None) -> Polyhedron:
+def stage_constraints(system: System, constraints: Polyhedron | None) -> Polyhedron:
     """Return Z over the stacked (x, u): the input bounds, and ``constraints`` if there are some.
 
     Raises a ValueError if these do not fit.

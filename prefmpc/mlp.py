@@ -1,0 +1,172 @@
+"""A plain neural network as σ: it can be anything, convex or not."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
+
+import jax
+import numpy as np
+from jax.typing import ArrayLike
+
+from prefmpc._checks import finite_array, nonnegative, positive_int, require_x64
+from prefmpc._network import ACTIVATIONS, Over, StageNetwork, check_columns, check_scale
+from prefmpc._pytree import register_pytree
+from prefmpc._random import generator
+
+MLPActivation = Literal["relu", "tanh", "softplus"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False, init=False)
+class MLPCost(StageNetwork):
+    """A feed-forward network as σ (arXiv 2511.22502, section II-B); it need not be convex.
+
+    With v = (x_k, u_k) / scale, summed over the stages k = 0 … N−1 (``over="stage"``), or
+    v = (x_0 … x_{N−1}, u_0 … u_{N−1}) / scale (``over="trajectory"``):
+
+        z_1 = g(W_1 v + b_1),  z_{i+1} = g(W_{i+1} z_i + b_{i+1}),  σ = c·z_L + floor·‖v‖²
+
+    Nothing keeps it from falling without end where there were no data: give it a ``floor``, or
+    add a `QuadraticCost` by `SumCost`. Build one with `random`; train it with `fit_network`.
+
+    Parameters
+    ----------
+    W : sequence of arrays (..., width_i, width_{i−1}), with width_0 = n_v
+    b : sequence of arrays (..., width_i)
+    c : array (..., width_L)
+    scale : array (n_x + n_u,)
+        Positive; the size of each signal, so that v is of order one.
+    activation : {"tanh", "softplus", "relu"}
+        g(a) = tanh(a), log(1 + eᵃ) or max(a, 0). The last is not smooth.
+    floor : float
+        Nonnegative.
+    over : {"stage", "trajectory"}
+
+    Raises
+    ------
+    ValueError
+        If a shape does not fit, or something is not finite.
+    """
+
+    W: tuple[Any, ...]
+    b: tuple[Any, ...]
+    c: Any
+    scale: tuple[float, ...]
+    activation: MLPActivation
+    floor: float
+    over: Over
+
+    def __init__(
+        self,
+        W: Sequence[ArrayLike],
+        b: Sequence[ArrayLike],
+        c: ArrayLike,
+        *,
+        scale: ArrayLike,
+        activation: MLPActivation = "tanh",
+        floor: float = 0.0,
+        over: Over = "stage",
+    ) -> None:
+        if activation not in get_args(MLPActivation):
+            raise ValueError(
+                f"activation must be one of {get_args(MLPActivation)}, got {activation!r}"
+            )
+        size = check_scale(scale, over)
+        if not len(W) == len(b) >= 1:
+            raise ValueError(
+                f"W and b must hold the same number of layers, at least one, "
+                f"got {len(W)} and {len(b)}"
+            )
+        weights = [np.asarray(finite_array(f"W[{i}]", a)) for i, a in enumerate(W)]
+        offsets = [np.asarray(finite_array(f"b[{i}]", a)) for i, a in enumerate(b)]
+        out = np.asarray(finite_array("c", c))
+        n_v = weights[0].shape[-1] if weights[0].ndim else 0
+        widths = [n_v, *(offset.shape[-1] if offset.ndim else 0 for offset in offsets)]
+        lead = out.shape[:-1]
+        wanted = {
+            **{f"W[{i}]": widths[i : i + 2][::-1] for i in range(len(weights))},
+            **{f"b[{i}]": [width] for i, width in enumerate(widths[1:])},
+            "c": widths[-1:],
+        }
+        for (name, shape), array in zip(wanted.items(), [*weights, *offsets, out], strict=True):
+            if array.shape != (*lead, *shape):
+                raise ValueError(f"{name} must have shape {(*lead, *shape)}, got {array.shape}")
+        check_columns("W[0]", n_v, size.size, over)
+        values: dict[str, Any] = {
+            "W": tuple(weights),
+            "b": tuple(offsets),
+            "c": out,
+            "scale": tuple(float(s) for s in size),
+            "activation": activation,
+            "floor": nonnegative("floor", floor),
+            "over": over,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def columns(self) -> int:
+        """Number of entries of v."""
+        return int(self.W[0].shape[-1])
+
+    def _network(self, v: Any) -> Any:
+        g = ACTIVATIONS[self.activation]
+        z = v
+        for W, b in zip(self.W, self.b, strict=True):
+            z = g(z @ W.T + b)
+        return z @ self.c + self.floor * (v * v).sum(-1)
+
+    def bounds(self) -> tuple[MLPCost, MLPCost]:
+        """Return infinite bounds: every weight may be anything."""
+        low, high = (
+            jax.tree.map(lambda leaf, side=side: np.full(leaf.shape, side), self)
+            for side in (-np.inf, np.inf)
+        )
+        return low, high
+
+    @classmethod
+    def random(
+        cls,
+        scale: ArrayLike,
+        *,
+        key: Any,
+        widths: Sequence[int] = (16, 16),
+        steps: int | None = None,
+        shape: tuple[int, ...] = (),
+        activation: MLPActivation = "tanh",
+        floor: float = 0.0,
+    ) -> MLPCost:
+        """Draw a stack of networks to start training from (weights of Glorot's size).
+
+        Parameters
+        ----------
+        scale : array (n_x + n_u,)
+            The size of each state and input.
+        widths : sequence of int
+            Units of each hidden layer.
+        steps : int, optional
+            The network then looks at whole trajectories of so many steps, instead of stages.
+        shape : leading shape of the stack.
+        activation, floor : as for the class.
+        """
+        require_x64()
+        size = np.asarray(finite_array("scale", scale, ndim=1))
+        sizes = [positive_int(f"widths[{i}]", width) for i, width in enumerate(widths)]
+        if not sizes:
+            raise ValueError("widths must name at least one layer, got none")
+        n_v = size.size if steps is None else size.size * positive_int("steps", steps)
+        rng = generator(key)
+
+        def layer(after: int, before: int) -> np.ndarray:
+            return rng.standard_normal((*shape, after, before)) * np.sqrt(2 / (after + before))
+
+        W = [layer(after, before) for before, after in itertools.pairwise([n_v, *sizes])]
+        b = [0.1 * rng.standard_normal((*shape, width)) for width in sizes]
+        c = layer(1, sizes[-1])[..., 0, :]
+        over: Over = "stage" if steps is None else "trajectory"
+        return cls(W, b, c, scale=size, activation=activation, floor=floor, over=over)
+
+
+register_pytree(MLPCost, static=("scale", "activation", "floor", "over"))

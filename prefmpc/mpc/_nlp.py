@@ -1,0 +1,221 @@
+"""Bounded nonlinear programs min f(z), c(z) ≤ 0, lower ≤ z ≤ upper: SLSQP, IPOPT, and a check."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize, nnls
+
+ACTIVE = 1e-6
+"""A constraint this close to its limit may carry a multiplier."""
+
+SLSQP_LIMIT = 9  # SLSQP's code for the iteration limit; IPOPT's is below
+IPOPT_LIMIT = -1
+HUGE = 1e20
+
+
+@dataclasses.dataclass(frozen=True)
+class Program:
+    """Functions of z (n,), already compiled.
+
+    Attributes
+    ----------
+    values : z → f, c (m,)
+    slopes : z → ∇f (n,), ∂c/∂z (m, n)
+    curvature : z, multipliers (m,), factor → factor·∇²f + Σ_i multiplier_i ∇²c_i, (n, n)
+    lower, upper : array (n,)
+    rows : m
+    """
+
+    values: Callable[[Any], tuple[float, np.ndarray]]
+    slopes: Callable[[Any], tuple[np.ndarray, np.ndarray]]
+    curvature: Callable[[Any, Any, float], np.ndarray]
+    lower: np.ndarray
+    upper: np.ndarray
+    rows: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Attempt:
+    """Where a solver stopped: the point, whether for its iteration limit, and what was reached."""
+
+    z: np.ndarray
+    limited: bool
+    iterations: int
+    violation: float
+    residual: float
+
+    def good(self, feasibility: float, optimality: float) -> bool:
+        """Whether the point satisfies the constraints and the conditions for a minimum."""
+        return self.violation <= feasibility and self.residual <= optimality
+
+
+def attempt(
+    program: Program, start: np.ndarray, solver: str, max_iterations: int, tol: float
+) -> Attempt:
+    """Run a solver from ``start``, and judge where it stops without trusting what it says."""
+    run = _ipopt if solver == "ipopt" else _slsqp
+    z, limited, count = run(program, np.clip(start, program.lower, program.upper), max_iterations)
+    best = _judge(program, z, limited, count)
+    if solver == "slsqp" and best.violation <= ACTIVE and best.residual > tol and not limited:
+        # A fresh quasi-Newton matrix often gets on from where an old one was stuck.
+        z, limited, more = _slsqp(program, z, max_iterations)
+        again = _judge(program, z, limited, count + more)
+        if again.residual < best.residual and again.violation <= ACTIVE:
+            best = again
+    return best
+
+
+def least_violation(program: Program, start: np.ndarray) -> tuple[np.ndarray, float]:
+    """Return the point near ``start`` with the smallest Σ max(c, 0)², and its largest violation."""
+
+    def value_and_slope(z: np.ndarray) -> tuple[float, np.ndarray]:
+        _, c = program.values(z)
+        if not np.isfinite(c).all():
+            return HUGE, np.zeros_like(z)
+        excess = np.maximum(c, 0)
+        return float(excess @ excess) / 2, excess @ program.slopes(z)[1]
+
+    box = list(zip(program.lower, program.upper, strict=True))
+    inside = np.clip(start, program.lower, program.upper)
+    found = minimize(value_and_slope, inside, jac=True, bounds=box, method="L-BFGS-B")
+    return found.x, max(0.0, float(np.max(program.values(found.x)[1], initial=0.0)))
+
+
+def _judge(program: Program, z: np.ndarray, limited: bool, iterations: int) -> Attempt:
+    z = np.clip(z, program.lower, program.upper)
+    value, c = program.values(z)
+    if not (np.isfinite(value) and np.isfinite(c).all()):
+        return Attempt(z, limited, iterations, np.inf, np.inf)
+    violation = max(0.0, float(np.max(c, initial=0.0)))
+    return Attempt(z, limited, iterations, violation, stationarity(program, z, c))
+
+
+def stationarity(program: Program, z: np.ndarray, c: np.ndarray) -> float:
+    """Return how far ∇f is from what active constraints can balance, relative to 1 + ‖∇f‖∞.
+
+    The multipliers are the best nonnegative ones, from a least-squares problem of their own.
+    """
+    slope, jacobian = program.slopes(z)
+    if not (np.isfinite(slope).all() and np.isfinite(jacobian).all()):
+        return np.inf
+    eye = np.eye(z.size)
+    width = np.minimum(program.upper - program.lower, 1.0)
+    pushing = np.concatenate(
+        [
+            jacobian[c > -ACTIVE],
+            eye[program.upper - z <= ACTIVE * width],
+            -eye[z - program.lower <= ACTIVE * width],
+        ]
+    )
+    rest = slope
+    if len(pushing):
+        size = np.maximum(np.linalg.norm(pushing, axis=1), 1e-12)
+        directions = (pushing / size[:, None]).T
+        multipliers, _ = nnls(directions, -slope, maxiter=30 * len(pushing))
+        rest = slope + directions @ multipliers
+    return float(np.abs(rest).max() / (1 + np.abs(slope).max()))
+
+
+def _slsqp(
+    program: Program, start: np.ndarray, max_iterations: int
+) -> tuple[np.ndarray, bool, int]:
+    last: dict[str, Any] = {}
+
+    def values(z: np.ndarray) -> tuple[float, np.ndarray]:
+        if "z" not in last or not np.array_equal(z, last["z"]):
+            f, c = program.values(z)
+            bad = not (np.isfinite(f) and np.isfinite(c).all())
+            # A trial step that leaves the numbers is only too long.
+            last.update(z=z.copy(), f=HUGE if bad else f, c=np.zeros_like(c) if bad else c)
+            last.pop("slopes", None)
+        return last["f"], last["c"]
+
+    def slopes(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values(z)
+        if "slopes" not in last:
+            last["slopes"] = program.slopes(z)
+        return last["slopes"]
+
+    size = 1 + abs(values(start)[0])
+    constraints = []
+    if program.rows:
+        constraints = [
+            {"type": "ineq", "fun": lambda z: -values(z)[1], "jac": lambda z: -slopes(z)[1]}
+        ]
+    found = minimize(
+        lambda z: values(z)[0] / size,
+        start,
+        jac=lambda z: slopes(z)[0] / size,
+        bounds=list(zip(program.lower, program.upper, strict=True)),
+        constraints=constraints,
+        method="SLSQP",
+        options={"maxiter": max_iterations, "ftol": 1e-13},
+    )
+    return np.asarray(found.x), int(found.status) == SLSQP_LIMIT, int(found.nit)
+
+
+def _ipopt(
+    program: Program, start: np.ndarray, max_iterations: int
+) -> tuple[np.ndarray, bool, int]:
+    import ipyopt
+
+    n, m = start.size, program.rows
+    last: dict[str, Any] = {}
+    count = [0]
+
+    def cached(name: str, z: np.ndarray) -> Any:
+        if "z" not in last or not np.array_equal(z, last["z"]):
+            last.clear()
+            last["z"] = z.copy()
+        if name not in last:
+            last[name] = getattr(program, name)(last["z"])
+        return last[name]
+
+    def value(z: np.ndarray) -> float:
+        return float(cached("values", z)[0])
+
+    def gradient(z: np.ndarray, out: np.ndarray) -> None:
+        out[:] = cached("slopes", z)[0]
+
+    def limits(z: np.ndarray, out: np.ndarray) -> None:
+        out[:] = cached("values", z)[1]
+
+    def jacobian(z: np.ndarray, out: np.ndarray) -> None:
+        out[:] = cached("slopes", z)[1].ravel()
+
+    lower_rows, lower_columns = np.tril_indices(n)
+
+    def hessian(z: np.ndarray, multipliers: np.ndarray, factor: float, out: np.ndarray) -> None:
+        out[:] = program.curvature(z, multipliers, factor)[lower_rows, lower_columns]
+
+    def each_iteration(*report: Any) -> bool:
+        count[0] = int(report[1])
+        return True
+
+    rows, columns = np.divmod(np.arange(m * n), n)
+    problem = ipyopt.Problem(
+        n,
+        np.maximum(program.lower, -HUGE),
+        np.minimum(program.upper, HUGE),
+        m,
+        np.full(m, -HUGE),
+        np.zeros(m),
+        (rows, columns),
+        (lower_rows, lower_columns),
+        value,
+        gradient,
+        limits,
+        jacobian,
+        hessian,
+        intermediate_callback=each_iteration,
+        ipopt_options={
+            **{"print_level": 0, "sb": "yes", "max_iter": max_iterations, "tol": 1e-9},
+            **{"mu_strategy": "adaptive", "bound_relax_factor": 0.0},
+        },
+    )
+    z, _, status = problem.solve(start.copy())
+    return np.asarray(z), status == IPOPT_LIMIT, count[0]

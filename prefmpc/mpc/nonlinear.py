@@ -1,0 +1,447 @@
+"""MPC for nonlinear plants and any differentiable σ: single shooting with exact derivatives."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Any, Literal, NamedTuple, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from prefmpc._checks import finite_array, function, instance, nonnegative, positive_int, shaped
+from prefmpc._pytree import bypass_init
+from prefmpc.models import CostModel
+from prefmpc.mpc import _nlp
+from prefmpc.mpc.solution import (
+    Controller,
+    MPCSolution,
+    check_dimension,
+    check_single_state,
+    infeasible_message,
+)
+from prefmpc.mpc.steady import SteadyState, check_reference, with_reference
+from prefmpc.mpc.terminal import TerminalIngredients
+from prefmpc.sets import Ellipsoid, Polyhedron
+from prefmpc.systems import System
+from prefmpc.trajectories import Trajectory
+
+Solver = Literal["slsqp", "ipopt"]
+FEASIBLE = 1e-6
+
+
+class _Problem(NamedTuple):
+    """All that is not a function; None where there is nothing."""
+
+    system: System
+    cost: Any
+    stages: Any
+    last: Any
+    ball: Any
+    final: Any
+    scale: Any
+
+
+class _Given(NamedTuple):
+    """What changes from solve to solve."""
+
+    x0: Any
+    reference: Any
+    before: Any
+
+
+class NonlinearMPC(Controller):
+    """The controller min σ(T) s.t. x_0 = x(t), x_{k+1} = f(x_k, u_k), (x_k, u_k) ∈ Z, x_N ∈ X_N.
+
+    Implements eq. (7) of arXiv 2511.22502 for any plant and any differentiable σ. The inputs are
+    the only unknowns (single shooting); JAX differentiates through the plant. The answer is a
+    local minimum: constraints and the conditions for a minimum are checked after each solve,
+    whatever the solver says of itself.
+
+    Parameters
+    ----------
+    system : LinearSystem or NonlinearSystem
+        Its input bounds are part of Z.
+    cost : σ model
+        A single one. Where it is not smooth, solves may stop at a kink and count as failed.
+    horizon : int
+        N ≥ 1.
+    constraints : Polyhedron, optional
+        Over the stacked (x_k, u_k), for k = 0 … N−1.
+    path : function x (nx,), u (nu,) → array (m,), optional
+        In `jax.numpy`; path(x_k, u_k) ≤ 0 for k = 0 … N−1.
+    terminal : Polyhedron, Ellipsoid or TerminalIngredients, optional
+        X_N; or the ingredients, whose polyhedron is X_N and whose x_NᵀPx_N is added to the cost.
+    solver : {"slsqp", "ipopt"}
+        SciPy's SLSQP, or IPOPT with exact second derivatives (``pip install prefmpc[ipopt]``).
+    tol : float
+        How far ∇σ, relative to 1 + ‖∇σ‖∞, may be from what active constraints balance.
+    max_iterations : int
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range or a dimension does not fit.
+    ImportError
+        If IPOPT is asked for and `ipyopt` is not installed.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        cost: CostModel,
+        horizon: int,
+        *,
+        constraints: Polyhedron | None = None,
+        path: Callable[[Any, Any], Any] | None = None,
+        terminal: Polyhedron | Ellipsoid | TerminalIngredients | None = None,
+        solver: Solver = "slsqp",
+        tol: float = 1e-4,
+        max_iterations: int = 200,
+    ) -> None:
+        instance("system", system, System)
+        if not isinstance(cost, CostModel):
+            raise ValueError(f"cost must be a σ model, got {type(cost).__name__}")
+        if getattr(cost, "batch_shape", ()):
+            raise ValueError(f"cost must be a single model, got a stack {cost.batch_shape}")  # type: ignore[attr-defined]
+        if solver not in get_args(Solver):
+            raise ValueError(f"solver must be one of {get_args(Solver)}, got {solver!r}")
+        if solver == "ipopt":
+            _need_ipopt()
+        self.system, self.cost = system, cost
+        self.horizon = positive_int("horizon", horizon)
+        self.solver, self.tol = solver, nonnegative("tol", tol)
+        self.max_iterations = positive_int("max_iterations", max_iterations)
+        self._path = path
+        if path is not None:
+            function("path", path)
+            _check_path(path, system)
+        self._problem = self._sets(constraints, terminal)
+        self.reset()
+        self._check_cost()
+
+    def _sets(self, constraints: Any, terminal: Any) -> _Problem:
+        nx, nu = self.system.nx, self.system.nu
+        stages = last = ball = final = None
+        self._constraints = constraints
+        if constraints is not None:
+            instance("constraints", constraints, Polyhedron)
+            check_dimension("constraints", constraints.dim, nx + nu)
+            stages = constraints.H, constraints.h
+        self._ingredients = isinstance(terminal, TerminalIngredients)
+        if isinstance(terminal, TerminalIngredients):
+            check_dimension("terminal", len(terminal.P), nx)
+            final, terminal = terminal.P, terminal.polyhedron
+        if isinstance(terminal, Ellipsoid):
+            check_dimension("terminal", terminal.dim, nx)
+            ball = (terminal.P, terminal.level) if np.isfinite(terminal.level) else None
+        elif terminal is not None:
+            instance("terminal", terminal, Polyhedron)
+            check_dimension("terminal", terminal.dim, nx)
+            last = terminal.H, terminal.h
+        low, high = self.system.u_min, self.system.u_max
+        half = (high - low) / 2
+        scale = np.tile(np.where(np.isfinite(half), half, 1.0), self.horizon)
+        return _Problem(self.system, self.cost, stages, last, ball, final, scale)
+
+    def _check_cost(self) -> None:
+        N, system = self.horizon, self.system
+        x, u = np.zeros((N + 1, system.nx)), np.zeros((N, system.nu))
+        y = np.zeros((N, system.ny))
+        r = {"x_r": x[0], "u_r": u[0], "y_r": y[0]}
+        try:
+            jax.eval_shape(self.cost, bypass_init(Trajectory, x=x, u=u, y=y, u_before=u[0], **r))
+        except ValueError as error:
+            raise ValueError(f"cost must fit the system and the horizon: {error}") from None
+
+    def reset(self) -> None:
+        """Forget the last plan and the last input."""
+        self._plan: np.ndarray | None = None
+        self._applied: np.ndarray | None = None
+
+    def applied(self, u: np.ndarray) -> None:
+        """Take note of an input that the plant received: the next Δu starts there."""
+        self._applied = np.asarray(u)
+
+    def solve(
+        self,
+        x0: ArrayLike,
+        *,
+        reference: SteadyState | None = None,
+        u_before: ArrayLike | None = None,
+        start: ArrayLike | None = None,
+    ) -> MPCSolution:
+        """Solve for the state x0 (nx,); see `MPCSolution`.
+
+        Parameters
+        ----------
+        x0 : array (nx,)
+        reference : SteadyState, optional
+            σ sees deviations from it; without one, from the origin. Sets stay where they are.
+        u_before : array (nu,), optional
+            The input applied before, for σ of increments. Default: the last one that a call
+            returned, if any.
+        start : array (N, nu), optional
+            Inputs to start from. Default: the better of the last plan, moved on by one step, and
+            the input of the reference, held.
+        """
+        state = check_single_state(x0, self.system.nx)
+        began = time.perf_counter()
+        given = self._given(state, reference, u_before)
+        program = self._program(given)
+        tries = []
+        message = ""
+        for guess in self._starts(program, reference, start):
+            value, c = program.values(guess)
+            if not (np.isfinite(value) and np.isfinite(c).all()):
+                message = "f, g, path or σ returns NaN or infinity along the plan to start from"
+                continue
+            tries.append(_nlp.attempt(program, guess, self.solver, self.max_iterations, self.tol))
+            if tries[-1].good(FEASIBLE, self.tol):
+                break
+            if tries[-1].violation > FEASIBLE:
+                nearer, violation = _nlp.least_violation(program, tries[-1].z)
+                if violation > FEASIBLE:
+                    message = (
+                        f"{infeasible_message(state, self.horizon)}: the best plan found breaks "
+                        f"them by {violation:.2g}"
+                    )
+                    continue
+                tries.append(
+                    _nlp.attempt(program, nearer, self.solver, self.max_iterations, self.tol)
+                )
+                if tries[-1].good(FEASIBLE, self.tol):
+                    break
+        return self._solution(given, tries, message, began)
+
+    def _given(self, x0: np.ndarray, reference: Any, u_before: Any) -> _Given:
+        values = None
+        if reference is not None:
+            check_reference(reference, self.system, self._constraints, self._ingredients)
+            self._check_on_path(reference)
+            values = reference.x, reference.u, reference.y
+        before = self._applied
+        if u_before is not None:
+            before = np.asarray(finite_array("u_before", u_before, ndim=1))
+            shaped("u_before", before, (self.system.nu,), "the system's inputs")
+        return _Given(x0, values, before)
+
+    def _check_on_path(self, reference: SteadyState) -> None:
+        if self._path is None:
+            return
+        excess = np.asarray(self._path(reference.x, reference.u))
+        if not (excess <= FEASIBLE).all():
+            raise ValueError(f"reference must satisfy path(x, u) ≤ 0, got {excess}")
+
+    def _starts(self, program: Any, reference: Any, start: Any) -> list[np.ndarray]:
+        """Return scaled inputs to start from, the most promising first."""
+        N, nu, scale = self.horizon, self.system.nu, self._problem.scale
+        if start is not None:
+            U = np.asarray(finite_array("start", start))
+            if U.shape != (N, nu):
+                raise ValueError(f"start must have shape ({N}, {nu}), got {U.shape}")
+            return [np.clip(U.ravel() / scale, program.lower, program.upper)]
+        rest = np.zeros(nu) if reference is None else reference.u
+        plans = [np.tile(rest, (N, 1))]
+        if self._plan is not None:
+            plans.append(np.concatenate([self._plan[1:], self._plan[-1:]]))
+            plans.append(np.concatenate([self._plan[1:], rest[None]]))
+        guesses = [np.clip(U.ravel() / scale, program.lower, program.upper) for U in plans]
+
+        def merit(z: np.ndarray) -> float:
+            value, c = program.values(z)
+            total = value + 1e3 * (1 + abs(value)) * np.maximum(c, 0).sum()
+            return float(total) if np.isfinite(total) else np.inf
+
+        ranked = sorted(guesses, key=merit)
+        return ranked[:2] if len(ranked) > 1 else ranked
+
+    def _program(self, given: _Given) -> _nlp.Program:
+        layout, flat = _packed(self._problem, given, self._path, self.horizon)
+        scale = self._problem.scale
+        low, high = (np.tile(b, self.horizon) for b in (self.system.u_min, self.system.u_max))
+
+        def values(z: np.ndarray) -> tuple[float, np.ndarray]:
+            f, c = _values(layout, flat, z)
+            return float(f), np.asarray(c)
+
+        def slopes(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            g, J = _slopes(layout, flat, z)
+            return np.asarray(g), np.asarray(J)
+
+        def curvature(z: np.ndarray, multipliers: np.ndarray, factor: float) -> np.ndarray:
+            return np.asarray(_curvature(layout, flat, z, multipliers, factor))
+
+        rows = values(np.zeros(scale.size))[1].size
+        return _nlp.Program(values, slopes, curvature, low / scale, high / scale, rows)
+
+    def _solution(
+        self, given: _Given, tries: list[_nlp.Attempt], message: str, began: float
+    ) -> MPCSolution:
+        N, nu = self.horizon, self.system.nu
+        good = tries[-1] if tries and tries[-1].good(FEASIBLE, self.tol) else None
+        best = good or min(tries, key=lambda t: (t.violation > FEASIBLE, t.residual), default=None)
+        status, cost = "solved", np.nan
+        U = np.full((N, nu), np.nan)
+        X = np.full((N + 1, self.system.nx), np.nan)
+        if good is not None:
+            message = "a local minimum"
+            z = (good.z * self._problem.scale).reshape(N, nu)
+            U = np.clip(z, self.system.u_min, self.system.u_max)
+            f, x = _along(*_packed(self._problem, given, self._path, N), U)
+            cost, X = float(f), np.array(x)
+            self._plan = U
+        elif best is None:
+            status = "failed"
+        elif best.violation > FEASIBLE:
+            status = "infeasible" if message.startswith("no input") else "failed"
+            message = message or f"the plan breaks the constraints by {best.violation:.2g}"
+        else:
+            status = "max_iterations" if best.limited else "failed"
+            message = (
+                f"{best.iterations} iterations ended at a plan that is not a minimum: residual "
+                f"{best.residual:.2g}, wanted {self.tol:.2g}"
+            )
+        if good is None:
+            self._plan = None
+        solution = MPCSolution(
+            u=U[0],
+            trajectory=bypass_init(Trajectory, x=X, u=U, y=self.system.output(X[:-1])),
+            cost=cost,
+            status=status,
+            message=message,
+            iterations=sum(t.iterations for t in tries),
+            residual=best.residual if best is not None else np.inf,
+            seconds=time.perf_counter() - began,
+        )
+        if given.reference is None:
+            return solution
+        return with_reference(solution, SteadyState(*given.reference))
+
+
+def _need_ipopt() -> None:
+    try:
+        import ipyopt  # noqa: F401
+    except ImportError as error:
+        raise ImportError(
+            'solver="ipopt" needs the package ipyopt: pip install "prefmpc[ipopt]"'
+        ) from error
+
+
+def _check_path(path: Callable[[Any, Any], Any], system: System) -> None:
+    x, u = (jax.ShapeDtypeStruct((size,), np.float64) for size in (system.nx, system.nu))
+    try:
+        shape = jax.eval_shape(path, x, u).shape
+    except Exception as error:
+        raise ValueError(f"path(x, u) must work on JAX arrays, but raised: {error}") from error
+    if len(shape) != 1:
+        raise ValueError(f"path must return an array of shape (m,), got shape {shape}")
+
+
+def _plan(problem: _Problem, given: _Given, U: Any) -> Trajectory:
+    """Run the plant along the inputs U (N, nu)."""
+    system = problem.system
+
+    def step(x: Any, u: Any) -> tuple[Any, Any]:
+        x_next = system.step(x, u)
+        return x_next, x_next
+
+    _, x = jax.lax.scan(step, jnp.asarray(given.x0), U)
+    x = jnp.concatenate([jnp.asarray(given.x0)[None], x])
+    names = ("x_r", "u_r", "y_r")
+    optional = {} if given.reference is None else dict(zip(names, given.reference, strict=True))
+    optional = {name: jnp.asarray(value) for name, value in optional.items()}
+    if given.before is not None:
+        optional["u_before"] = jnp.asarray(given.before)
+    return bypass_init(Trajectory, x=x, u=U, y=system.output(x[:-1]), **optional)
+
+
+class _Layout(NamedTuple):
+    """How one vector holds a problem and what is given; and the parts that are not numbers."""
+
+    tree: Any
+    shapes: tuple[tuple[int, ...], ...]
+    path: Any
+    horizon: int
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Known:
+    """A layout that is hashed by its identity: a compiled program is found at once."""
+
+    layout: _Layout
+
+    def unpack(self, flat: Any) -> tuple[_Problem, _Given]:
+        leaves, at = [], 0
+        for shape in self.layout.shapes:
+            size = int(np.prod(shape))
+            leaves.append(flat[at : at + size].reshape(shape))
+            at += size
+        return jax.tree.unflatten(self.layout.tree, leaves)
+
+
+@lru_cache(maxsize=1024)
+def _known(layout: _Layout) -> _Known:
+    return _Known(layout)
+
+
+def _packed(problem: _Problem, given: _Given, path: Any, horizon: int) -> tuple[_Known, Any]:
+    # One array goes to the compiled programs: with the twenty of a problem, handing them over
+    # takes longer than all that is computed.
+    leaves, tree = jax.tree.flatten((problem, given))
+    layout = _Layout(tree, tuple(np.shape(leaf) for leaf in leaves), path, horizon)
+    flat = np.concatenate([np.ravel(leaf) for leaf in leaves])
+    return _known(layout), jax.device_put(flat)
+
+
+def _both(known: _Known, flat: Any, z: Any) -> tuple[Any, Any]:
+    """Return σ and the constraints c ≤ 0 (m,) for scaled inputs z (N·nu,)."""
+    problem, given = known.unpack(flat)
+    path = known.layout.path
+    U = (z * problem.scale).reshape(known.layout.horizon, problem.system.nu)
+    T = _plan(problem, given, U)
+    total, limits = problem.cost(T), []
+    if problem.stages is not None:
+        H, h = problem.stages
+        rows = jnp.concatenate([T.x[:-1], U], axis=-1) @ H.T - h
+        limits.append(rows.ravel())
+    if path is not None:
+        limits.append(jax.vmap(path)(T.x[:-1], U).ravel())
+    if problem.last is not None:
+        H, h = problem.last
+        limits.append(H @ T.x[-1] - h)
+    if problem.ball is not None:
+        P, level = problem.ball
+        limits.append((T.x[-1] @ P @ T.x[-1] - level)[None])
+    if problem.final is not None:
+        total = total + T.x[-1] @ problem.final @ T.x[-1]
+    return total, jnp.concatenate(limits) if limits else jnp.zeros(0)
+
+
+_values = jax.jit(_both, static_argnums=0)
+
+
+@jax.jit(static_argnums=0)
+def _slopes(known: _Known, flat: Any, z: Any) -> tuple[Any, Any]:
+    gradient = jax.grad(lambda w: _both(known, flat, w)[0])(z)
+    return gradient, jax.jacfwd(lambda w: _both(known, flat, w)[1])(z)
+
+
+@jax.jit(static_argnums=0)
+def _curvature(known: _Known, flat: Any, z: Any, multipliers: Any, factor: Any) -> Any:
+    def lagrangian(w: Any) -> Any:
+        f, c = _both(known, flat, w)
+        return factor * f + multipliers @ c
+
+    return jax.hessian(lagrangian)(z)
+
+
+@jax.jit(static_argnums=0)
+def _along(known: _Known, flat: Any, U: Any) -> tuple[Any, Any]:
+    problem, given = known.unpack(flat)
+    f, _ = _both(known, flat, U.ravel() / problem.scale)
+    return f, _plan(problem, given, U).x
