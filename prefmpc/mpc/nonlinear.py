@@ -77,7 +77,8 @@ class NonlinearMPC(Controller):
     terminal : Polyhedron, Ellipsoid or TerminalIngredients, optional
         X_N; or the ingredients, whose polyhedron is X_N and whose x_NᵀPx_N is added to the cost.
     solver : {"slsqp", "ipopt"}
-        SciPy's SLSQP, or IPOPT with exact second derivatives (``pip install prefmpc[ipopt]``).
+        Newton steps on quadratic programs, with SciPy's SLSQP where these do not arrive; or IPOPT
+        (``pip install prefmpc[ipopt]``). Both with exact second derivatives.
     tol : float
         How far ∇σ, relative to 1 + ‖∇σ‖∞, may be from what active constraints balance.
     max_iterations : int
