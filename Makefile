@@ -71,6 +71,7 @@ bench: $(STAMP)
 	@$(BIN)/python -W ignore benchmarks/speed.py
 	@$(BIN)/python -W ignore benchmarks/learning.py
 	@$(BIN)/python -W ignore benchmarks/solvers.py
+	@$(BIN)/python -W ignore benchmarks/nonlinear.py
 
 # ---- the checks ----
 

@@ -275,7 +275,7 @@ APART = jax.tree.map(lambda *leaves: np.stack(leaves), TWO, SHIFTED)
         ),
         (lambda: win_rate(prefers_less, TWO, TWO, confidence=-1), "confidence must be finite and"),
         (lambda: win_rate(prefers_less, TWO, TWO, confidence="1"), "confidence must be a number"),
-        (lambda: simulate("plant", still, RADIUS, 2), "system must be a LinearSystem, got str"),
+        (lambda: simulate("plant", still, RADIUS, 2), "system must be a System, got str"),
         (lambda: simulate(MASSES, still, RADIUS[:5], 2), r"x0 must have shape \(..., 6\)"),
         (lambda: simulate(MASSES, still, RADIUS * np.nan, 2), "x0 must be finite"),
         (lambda: simulate(MASSES, still, RADIUS, 0), "steps must be a whole number"),

@@ -235,7 +235,7 @@ NAN_X[1, 0] = np.nan
         (lambda: rollout(PLANT, [1, 2], [[1, 1]], 0), "steps must be a whole number of at least 1"),
         (lambda: rollout(PLANT, [1, 2], lambda x: x, 2), r"law must return .*\(1,\)"),
         (lambda: rollout(PLANT, np.ones((3, 2)), np.ones((2, 1, 2)), 2), "law must"),
-        (lambda: rollout("plant", [1, 2], [[1, 1]], 2), "system must be a LinearSystem"),
+        (lambda: rollout("plant", [1, 2], [[1, 1]], 2), "system must be a System"),
         (lambda: max_input(U), "trajectory must be a Trajectory, got ndarray"),
         (lambda: settling_time(X, -1), "epsilon must be finite and at least 0"),
         (lambda: settling_time(X, np.nan), "epsilon must be finite"),
