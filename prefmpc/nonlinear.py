@@ -166,14 +166,19 @@ def _shape_of(name: str, call: Callable[..., Any], *arguments: Any) -> tuple[int
 def _runge_kutta(f: Dynamics, dt: float, substeps: int) -> Dynamics:
     h = dt / substeps
 
+    def one(x: Any, u: Any) -> Any:
+        k1 = f(x, u)
+        k2 = f(x + h / 2 * k1, u)
+        k3 = f(x + h / 2 * k2, u)
+        k4 = f(x + h * k3, u)
+        return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+    if substeps == 1:
+        return one
+
     def step(x: Any, u: Any) -> Any:
-        for _ in range(substeps):
-            k1 = f(x, u)
-            k2 = f(x + h / 2 * k1, u)
-            k3 = f(x + h / 2 * k2, u)
-            k4 = f(x + h * k3, u)
-            x = x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-        return x
+        # A loop of known length: compiled once whatever the length, and differentiable.
+        return jax.lax.fori_loop(0, substeps, lambda _, z: one(z, u), x)
 
     return step
 
