@@ -3,7 +3,8 @@
 ``python -m prefmpc.studies NAME`` repeats one of them for many seeds and writes the file of
 results that the book reads. NAME is "quadratic" and "distinct" (case study 1), "settling" and
 "ties" (case study 2), "measures" (what accuracy does not tell), "priors" and "calibration" (what a
-prior is worth), "onesided" (a person whom no quadratic represents) or "stability".
+prior is worth), "onesided" (a person whom no quadratic represents), "references" (many set
+points), "signals" (what σ may see) or "stability".
 """
 
 from prefmpc.studies.measures import baselines, measures_case

@@ -10,7 +10,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from prefmpc.studies import measures, onesided, priors, quadratic, settling, stability
+from prefmpc.studies import (
+    measures,
+    onesided,
+    priors,
+    quadratic,
+    references,
+    settling,
+    signals,
+    stability,
+)
 from prefmpc.studies.spread import write_spread
 
 BOOK = Path(__file__).parents[2] / "book"
@@ -78,10 +87,27 @@ STUDIES: dict[str, Study] = {
             "controllers": onesided.CONTROLLERS,
         },
     ),
+    "references": (
+        references.references_case,
+        "extensions/references_spread.json",
+        {
+            **{"people": references.PEOPLE, "learners": references.LEARNERS},
+            "controllers": references.CONTROLLERS,
+        },
+    ),
     "stability": (
         stability.stability_case,
         "extensions/stability_spread.json",
         {"plants": stability.PLANTS, "checks": stability.CHECKS},
+    ),
+    "signals": (
+        signals.signals_case,
+        "extensions/signals_spread.json",
+        {
+            **{"cases": signals.CASES, "sizes": signals.SIGNALS_SIZES},
+            **{"learners": signals.LEARNERS, "tests": signals.TESTS, "alone": signals.ALONE},
+            **{"jerk sizes": signals.JERK_SIZES, "jerk learners": signals.JERK_LEARNERS},
+        },
     ),
     "measures": (
         measures.measures_case,
