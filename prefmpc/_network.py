@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Self
+from typing import Any, Literal, Self, get_args
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,11 @@ from prefmpc._checks import finite_array, instance, shaped
 from prefmpc._pytree import check_index
 from prefmpc.trajectories import Trajectory
 
-Over = Literal["stage", "trajectory"]
+Over = Literal["stage", "trajectory", "peak"]
+
+PEAK_POWER = 16
+"""A peak over time is a norm of this order: smooth, and at most a quarter above the maximum of 40
+equal values."""
 
 ACTIVATIONS: dict[str, Any] = {
     "softplus": jax.nn.softplus,
@@ -24,7 +28,7 @@ ACTIVATIONS: dict[str, Any] = {
 
 
 class StageNetwork:
-    """A network of v = (x_k, u_k) / scale, summed over the stages, or of all stages at once."""
+    """A network of v = (x_k, u_k) / scale: summed over the stages, at its peak, or of all at once."""
 
     scale: tuple[float, ...]
     over: Over
@@ -37,8 +41,10 @@ class StageNetwork:
         """Number of entries of v."""
         raise NotImplementedError
 
-    def _network(self, v: Any) -> Any:
-        """Return the network's output (...) for v (..., n_v)."""
+    floor: float
+
+    def _units(self, v: Any) -> Any:
+        """Return the last layer's units (..., width) for v (..., n_v)."""
         raise NotImplementedError
 
     @property
@@ -82,14 +88,23 @@ class StageNetwork:
         """Return σ (...) from stages (..., N, nx + nu)."""
         v = features / np.asarray(self.scale)
         if self.over == "trajectory":
-            return self._network(v.reshape(*v.shape[:-2], -1))
-        return self._network(v).sum(-1)
+            v = v.reshape(*v.shape[:-2], 1, -1)
+        units = self._units(v)
+        pooled = _peak(units) if self.over == "peak" else units.sum(-2)
+        return pooled @ self.c + self.floor * (v * v).sum((-2, -1))
+
+
+def _peak(units: Any) -> Any:
+    """Return the peak of nonnegative units (..., N, width) over time, smooth where it is zero."""
+    largest = jax.lax.stop_gradient(jnp.max(units, axis=-2, keepdims=True)) + 1e-6
+    shares = jnp.sum((units / largest) ** PEAK_POWER, axis=-2) + 1e-30
+    return largest[..., 0, :] * shares ** (1 / PEAK_POWER)
 
 
 def check_scale(scale: ArrayLike, over: str) -> np.ndarray:
     """Return the sizes of the signals, or raise a ValueError."""
-    if over not in ("stage", "trajectory"):
-        raise ValueError(f'over must be "stage" or "trajectory", got {over!r}')
+    if over not in get_args(Over):
+        raise ValueError(f"over must be one of {get_args(Over)}, got {over!r}")
     size = np.asarray(finite_array("scale", scale, ndim=1))
     if size.size == 0 or (size <= 0).any():
         raise ValueError(f"scale must hold positive numbers, got {size}")
@@ -98,7 +113,7 @@ def check_scale(scale: ArrayLike, over: str) -> np.ndarray:
 
 def check_columns(name: str, columns: int, signals: int, over: str) -> None:
     """Raise a ValueError unless a first layer fits the number of signals."""
-    if (columns != signals) if over == "stage" else (columns % signals or columns == 0):
+    if (columns % signals or columns == 0) if over == "trajectory" else columns != signals:
         raise ValueError(
             f"{name} must have {'a multiple of ' if over == 'trajectory' else ''}{signals} "
             f"columns, the entries of v, got {columns}"

@@ -74,6 +74,8 @@ class MLPCost(StageNetwork):
                 f"activation must be one of {get_args(MLPActivation)}, got {activation!r}"
             )
         size = check_scale(scale, over)
+        if over == "peak":
+            raise ValueError('over must be "stage" or "trajectory", peaks are for ICNNCost')
         if not len(W) == len(b) >= 1:
             raise ValueError(
                 f"W and b must hold the same number of layers, at least one, "
@@ -111,12 +113,12 @@ class MLPCost(StageNetwork):
         """Number of entries of v."""
         return int(self.W[0].shape[-1])
 
-    def _network(self, v: Any) -> Any:
+    def _units(self, v: Any) -> Any:
         g = ACTIVATIONS[self.activation]
         z = v
         for W, b in zip(self.W, self.b, strict=True):
             z = g(z @ W.T + b)
-        return z @ self.c + self.floor * (v * v).sum(-1)
+        return z
 
     def bounds(self) -> tuple[MLPCost, MLPCost]:
         """Return infinite bounds: every weight may be anything."""

@@ -36,6 +36,9 @@ class ICNNCost(StageNetwork):
         z_1 = g(V_1 v + b_1),  z_{i+1} = g(U_i z_i + V_{i+1} v + b_{i+1}),
         σ = c·z_L + floor·‖v‖²
 
+    With ``over="peak"`` each unit of z_L counts with its peak over the stages instead of its sum:
+    a norm over time of order 16, which is convex and nondecreasing too.
+
     with a convex nondecreasing g and nonnegative U_i, c (Amos, Xu and Kolter, 2017). A sum of
     convex functions with nonnegative weights is convex, and so is g of it.
 
@@ -55,7 +58,7 @@ class ICNNCost(StageNetwork):
         g(a) = log(1 + eᵃ), max(a, 0) or max(a, 0)².
     floor : float
         Nonnegative. Positive: σ is strictly convex.
-    over : {"stage", "trajectory"}
+    over : {"stage", "trajectory", "peak"}
     bias : bool
         False: all b are 0 and stay so. With a ReLU, squared or not, σ is then 0 at the origin and
         nowhere smaller: the set point is kept, whatever is learned.
@@ -146,12 +149,12 @@ class ICNNCost(StageNetwork):
         """Number of entries of v."""
         return int(self.V[0].shape[-1])
 
-    def _network(self, v: Any) -> Any:
+    def _units(self, v: Any) -> Any:
         act = ACTIVATIONS[self.activation]
         z = act(v @ self.V[0].T + self.b[0])
         for V, b, U in zip(self.V[1:], self.b[1:], self.U, strict=True):
             z = act(z @ U.T + v @ V.T + b)
-        return z @ self.c + self.floor * (v * v).sum(-1)
+        return z
 
     def bounds(self) -> tuple[ICNNCost, ICNNCost]:
         """Return the bounds that keep σ convex as two models: U ≥ 0, c ≥ 0; without bias b = 0."""
@@ -176,6 +179,7 @@ class ICNNCost(StageNetwork):
         activation: Activation = "softplus",
         floor: float = 0.0,
         bias: bool = True,
+        peak: bool = False,
     ) -> ICNNCost:
         """Draw a stack of networks to start training from.
 
@@ -189,6 +193,8 @@ class ICNNCost(StageNetwork):
             The network then looks at whole trajectories of so many steps, instead of stages.
         shape : leading shape of the stack.
         activation, floor, bias : as for the class.
+        peak : bool
+            Count peaks over time, ``over="peak"``; not together with ``steps``.
         """
         require_x64()
         size = np.asarray(finite_array("scale", scale, ndim=1))
@@ -204,7 +210,9 @@ class ICNNCost(StageNetwork):
             for before, after in itertools.pairwise(sizes)
         ]
         c = rng.uniform(0, 2 / sizes[-1], (*shape, sizes[-1]))
-        over: Over = "stage" if steps is None else "trajectory"
+        if peak and steps is not None:
+            raise ValueError(f"peak must be False for whole trajectories, got steps={steps}")
+        over: Over = "peak" if peak else "stage" if steps is None else "trajectory"
         options: dict[str, Any] = {"activation": activation, "floor": floor, "bias": bias}
         return cls(V, b, U, c, scale=size, over=over, **options)
 

@@ -211,6 +211,8 @@ def expression(cp: Any, cost: Any, X: Any, U: Any) -> Any:
     for name, leaf in (*((f"U[{i}]", leaf) for i, leaf in enumerate(cost.U)), ("c", cost.c)):
         if not (np.asarray(leaf) >= 0).all():
             raise ValueError(f"cost must be convex, but its {name} has negative entries or NaN")
+    if cost.over == "peak":
+        raise ValueError('cost must not be over="peak" here; NonlinearMPC takes it')
     if len(cost.scale) != nx + nu:
         raise ValueError(f"cost must see {nx + nu} signals, got {len(cost.scale)}")
     nonnegative("cost.floor", cost.floor)
