@@ -28,7 +28,7 @@ ACTIVATIONS: dict[str, Any] = {
 
 
 class StageNetwork:
-    """A network of v = (x_k, u_k) / scale: summed over the stages, at its peak, or of all at once."""
+    """A network of v = (x_k, u_k) / scale, over single stages or all of them at once."""
 
     scale: tuple[float, ...]
     over: Over

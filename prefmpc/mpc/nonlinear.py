@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import dataclasses
 import time
 from collections.abc import Callable
-from functools import lru_cache
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -17,6 +14,8 @@ from prefmpc._checks import finite_array, function, instance, nonnegative, posit
 from prefmpc._pytree import bypass_init
 from prefmpc.models import CostModel
 from prefmpc.mpc import _nlp
+from prefmpc.mpc import _shooting as shooting
+from prefmpc.mpc._shooting import Given, Problem
 from prefmpc.mpc.solution import (
     Controller,
     MPCSolution,
@@ -32,26 +31,6 @@ from prefmpc.trajectories import Trajectory
 
 Solver = Literal["slsqp", "ipopt"]
 FEASIBLE = 1e-6
-
-
-class _Problem(NamedTuple):
-    """All that is not a function; None where there is nothing."""
-
-    system: System
-    cost: Any
-    stages: Any
-    last: Any
-    ball: Any
-    final: Any
-    scale: Any
-
-
-class _Given(NamedTuple):
-    """What changes from solve to solve."""
-
-    x0: Any
-    reference: Any
-    before: Any
 
 
 class NonlinearMPC(Controller):
@@ -125,7 +104,7 @@ class NonlinearMPC(Controller):
         self.reset()
         self._check_cost()
 
-    def _sets(self, constraints: Any, terminal: Any) -> _Problem:
+    def _sets(self, constraints: Any, terminal: Any) -> Problem:
         nx, nu = self.system.nx, self.system.nu
         stages = last = ball = final = None
         self._constraints = constraints
@@ -147,7 +126,7 @@ class NonlinearMPC(Controller):
         low, high = self.system.u_min, self.system.u_max
         half = (high - low) / 2
         scale = np.tile(np.where(np.isfinite(half), half, 1.0), self.horizon)
-        return _Problem(self.system, self.cost, stages, last, ball, final, scale)
+        return Problem(self.system, self.cost, stages, last, ball, final, scale)
 
     def _check_cost(self) -> None:
         N, system = self.horizon, self.system
@@ -219,7 +198,7 @@ class NonlinearMPC(Controller):
                     break
         return self._solution(given, tries, message, began)
 
-    def _given(self, x0: np.ndarray, reference: Any, u_before: Any) -> _Given:
+    def _given(self, x0: np.ndarray, reference: Any, u_before: Any) -> Given:
         values = None
         if reference is not None:
             check_reference(reference, self.system, self._constraints, self._ingredients)
@@ -229,7 +208,7 @@ class NonlinearMPC(Controller):
         if u_before is not None:
             before = np.asarray(finite_array("u_before", u_before, ndim=1))
             shaped("u_before", before, (self.system.nu,), "the system's inputs")
-        return _Given(x0, values, before)
+        return Given(x0, values, before)
 
     def _check_on_path(self, reference: SteadyState) -> None:
         if self._path is None:
@@ -261,27 +240,27 @@ class NonlinearMPC(Controller):
         ranked = sorted(guesses, key=merit)
         return ranked[:2] if len(ranked) > 1 else ranked
 
-    def _program(self, given: _Given) -> _nlp.Program:
-        layout, flat = _packed(self._problem, given, self._path, self.horizon)
+    def _program(self, given: Given) -> _nlp.Program:
+        layout, flat = shooting.packed(self._problem, given, self._path, self.horizon)
         scale = self._problem.scale
         low, high = (np.tile(b, self.horizon) for b in (self.system.u_min, self.system.u_max))
 
         def values(z: np.ndarray) -> tuple[float, np.ndarray]:
-            f, c = _values(layout, flat, z)
+            f, c = shooting.values(layout, flat, z)
             return float(f), np.asarray(c)
 
         def slopes(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            g, J = _slopes(layout, flat, z)
+            g, J = shooting.slopes(layout, flat, z)
             return np.asarray(g), np.asarray(J)
 
         def curvature(z: np.ndarray, multipliers: np.ndarray, factor: float) -> np.ndarray:
-            return np.asarray(_curvature(layout, flat, z, multipliers, factor))
+            return np.asarray(shooting.curvature(layout, flat, z, multipliers, factor))
 
         rows = values(np.zeros(scale.size))[1].size
         return _nlp.Program(values, slopes, curvature, low / scale, high / scale, rows)
 
     def _solution(
-        self, given: _Given, tries: list[_nlp.Attempt], message: str, began: float
+        self, given: Given, tries: list[_nlp.Attempt], message: str, began: float
     ) -> MPCSolution:
         N, nu = self.horizon, self.system.nu
         good = tries[-1] if tries and tries[-1].good(FEASIBLE, self.tol) else None
@@ -293,7 +272,7 @@ class NonlinearMPC(Controller):
             message = "a local minimum"
             z = (good.z * self._problem.scale).reshape(N, nu)
             U = np.clip(z, self.system.u_min, self.system.u_max)
-            f, x = _along(*_packed(self._problem, given, self._path, N), U)
+            f, x = shooting.along(*shooting.packed(self._problem, given, self._path, N), U)
             cost, X = float(f), np.array(x)
             self._plan = U
         elif best is None:
@@ -341,108 +320,3 @@ def _check_path(path: Callable[[Any, Any], Any], system: System) -> None:
         raise ValueError(f"path(x, u) must work on JAX arrays, but raised: {error}") from error
     if len(shape) != 1:
         raise ValueError(f"path must return an array of shape (m,), got shape {shape}")
-
-
-def _plan(problem: _Problem, given: _Given, U: Any) -> Trajectory:
-    """Run the plant along the inputs U (N, nu)."""
-    system = problem.system
-
-    def step(x: Any, u: Any) -> tuple[Any, Any]:
-        x_next = system.step(x, u)
-        return x_next, x_next
-
-    _, x = jax.lax.scan(step, jnp.asarray(given.x0), U)
-    x = jnp.concatenate([jnp.asarray(given.x0)[None], x])
-    names = ("x_r", "u_r", "y_r")
-    optional = {} if given.reference is None else dict(zip(names, given.reference, strict=True))
-    optional = {name: jnp.asarray(value) for name, value in optional.items()}
-    if given.before is not None:
-        optional["u_before"] = jnp.asarray(given.before)
-    return bypass_init(Trajectory, x=x, u=U, y=system.output(x[:-1]), **optional)
-
-
-class _Layout(NamedTuple):
-    """How one vector holds a problem and what is given; and the parts that are not numbers."""
-
-    tree: Any
-    shapes: tuple[tuple[int, ...], ...]
-    path: Any
-    horizon: int
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Known:
-    """A layout that is hashed by its identity: a compiled program is found at once."""
-
-    layout: _Layout
-
-    def unpack(self, flat: Any) -> tuple[_Problem, _Given]:
-        leaves, at = [], 0
-        for shape in self.layout.shapes:
-            size = int(np.prod(shape))
-            leaves.append(flat[at : at + size].reshape(shape))
-            at += size
-        return jax.tree.unflatten(self.layout.tree, leaves)
-
-
-@lru_cache(maxsize=1024)
-def _known(layout: _Layout) -> _Known:
-    return _Known(layout)
-
-
-def _packed(problem: _Problem, given: _Given, path: Any, horizon: int) -> tuple[_Known, Any]:
-    # One array goes to the compiled programs: with the twenty of a problem, handing them over
-    # takes longer than all that is computed.
-    leaves, tree = jax.tree.flatten((problem, given))
-    layout = _Layout(tree, tuple(np.shape(leaf) for leaf in leaves), path, horizon)
-    flat = np.concatenate([np.ravel(leaf) for leaf in leaves])
-    return _known(layout), jax.device_put(flat)
-
-
-def _both(known: _Known, flat: Any, z: Any) -> tuple[Any, Any]:
-    """Return σ and the constraints c ≤ 0 (m,) for scaled inputs z (N·nu,)."""
-    problem, given = known.unpack(flat)
-    path = known.layout.path
-    U = (z * problem.scale).reshape(known.layout.horizon, problem.system.nu)
-    T = _plan(problem, given, U)
-    total, limits = problem.cost(T), []
-    if problem.stages is not None:
-        H, h = problem.stages
-        rows = jnp.concatenate([T.x[:-1], U], axis=-1) @ H.T - h
-        limits.append(rows.ravel())
-    if path is not None:
-        limits.append(jax.vmap(path)(T.x[:-1], U).ravel())
-    if problem.last is not None:
-        H, h = problem.last
-        limits.append(H @ T.x[-1] - h)
-    if problem.ball is not None:
-        P, level = problem.ball
-        limits.append((T.x[-1] @ P @ T.x[-1] - level)[None])
-    if problem.final is not None:
-        total = total + T.x[-1] @ problem.final @ T.x[-1]
-    return total, jnp.concatenate(limits) if limits else jnp.zeros(0)
-
-
-_values = jax.jit(_both, static_argnums=0)
-
-
-@jax.jit(static_argnums=0)
-def _slopes(known: _Known, flat: Any, z: Any) -> tuple[Any, Any]:
-    gradient = jax.grad(lambda w: _both(known, flat, w)[0])(z)
-    return gradient, jax.jacfwd(lambda w: _both(known, flat, w)[1])(z)
-
-
-@jax.jit(static_argnums=0)
-def _curvature(known: _Known, flat: Any, z: Any, multipliers: Any, factor: Any) -> Any:
-    def lagrangian(w: Any) -> Any:
-        f, c = _both(known, flat, w)
-        return factor * f + multipliers @ c
-
-    return jax.hessian(lagrangian)(z)
-
-
-@jax.jit(static_argnums=0)
-def _along(known: _Known, flat: Any, U: Any) -> tuple[Any, Any]:
-    problem, given = known.unpack(flat)
-    f, _ = _both(known, flat, U.ravel() / problem.scale)
-    return f, _plan(problem, given, U).x

@@ -1,0 +1,215 @@
+"""Single shooting: σ and the constraints as functions of the inputs, with exact derivatives.
+
+The plant runs once along the inputs; everything else is done for all steps at the same time. With
+the sensitivities S = ∂(X, U)/∂U and multipliers λ of the dynamics the curvature of the Lagrangian
+is Sᵀ(∇²L + Σ_k λ_{k+1}·∇²f_k)S: no derivative is taken through the loop over time.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from prefmpc._pytree import bypass_init
+from prefmpc.systems import System
+from prefmpc.trajectories import Trajectory
+
+
+class Problem(NamedTuple):
+    """All that is not a function; None where there is nothing."""
+
+    system: System
+    cost: Any
+    stages: Any
+    last: Any
+    ball: Any
+    final: Any
+    scale: Any
+
+
+class Given(NamedTuple):
+    """What changes from solve to solve."""
+
+    x0: Any
+    reference: Any
+    before: Any
+
+
+def _states(problem: Problem, given: Given, U: Any) -> Any:
+    """Run the plant along the inputs U (N, nu): the states (N + 1, nx)."""
+
+    def step(x: Any, u: Any) -> tuple[Any, Any]:
+        x_next = problem.system.step(x, u)
+        return x_next, x_next
+
+    _, x = jax.lax.scan(step, jnp.asarray(given.x0), U)
+    return jnp.concatenate([jnp.asarray(given.x0)[None], x])
+
+
+def _cost(problem: Problem, given: Given, X: Any, U: Any) -> Any:
+    """Return σ of the plan, with the terminal cost."""
+    names = ("x_r", "u_r", "y_r")
+    optional = {} if given.reference is None else dict(zip(names, given.reference, strict=True))
+    optional = {name: jnp.asarray(value) for name, value in optional.items()}
+    if given.before is not None:
+        optional["u_before"] = jnp.asarray(given.before)
+    y = problem.system.output(X[:-1])
+    total = problem.cost(bypass_init(Trajectory, x=X, u=U, y=y, **optional))
+    if problem.final is not None:
+        total = total + X[-1] @ problem.final @ X[-1]
+    return total
+
+
+def _on_stage(problem: Problem, path: Any, x: Any, u: Any) -> Any:
+    """Return the constraints (m,) ≤ 0 on one stage."""
+    rows = []
+    if problem.stages is not None:
+        H, h = problem.stages
+        rows.append(H @ jnp.concatenate([x, u]) - h)
+    if path is not None:
+        rows.append(path(x, u))
+    return jnp.concatenate(rows) if rows else jnp.zeros(0)
+
+
+def _at_end(problem: Problem, x: Any) -> Any:
+    """Return the constraints (m,) ≤ 0 on x_N."""
+    rows = []
+    if problem.last is not None:
+        H, h = problem.last
+        rows.append(H @ x - h)
+    if problem.ball is not None:
+        P, level = problem.ball
+        rows.append((x @ P @ x - level)[None])
+    return jnp.concatenate(rows) if rows else jnp.zeros(0)
+
+
+class _Layout(NamedTuple):
+    """How one vector holds a problem and what is given; and the parts that are not numbers."""
+
+    tree: Any
+    shapes: tuple[tuple[int, ...], ...]
+    path: Any
+    horizon: int
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Known:
+    """A layout that is hashed by its identity: a compiled program is found at once."""
+
+    layout: _Layout
+
+    def unpack(self, flat: Any) -> tuple[Problem, Given]:
+        leaves, at = [], 0
+        for shape in self.layout.shapes:
+            size = int(np.prod(shape))
+            leaves.append(flat[at : at + size].reshape(shape))
+            at += size
+        return jax.tree.unflatten(self.layout.tree, leaves)
+
+
+@lru_cache(maxsize=1024)
+def _known(layout: _Layout) -> Known:
+    return Known(layout)
+
+
+def packed(problem: Problem, given: Given, path: Any, horizon: int) -> tuple[Known, Any]:
+    # One array goes to the compiled programs: with the twenty of a problem, handing them over
+    # takes longer than all that is computed.
+    leaves, tree = jax.tree.flatten((problem, given))
+    layout = _Layout(tree, tuple(np.shape(leaf) for leaf in leaves), path, horizon)
+    flat = np.concatenate([np.ravel(leaf) for leaf in leaves])
+    return _known(layout), jax.device_put(flat)
+
+
+def _unpacked(known: Known, flat: Any, z: Any) -> tuple[Any, ...]:
+    problem, given = known.unpack(flat)
+    U = (z * problem.scale).reshape(known.layout.horizon, problem.system.nu)
+    return problem, given, known.layout.path, _states(problem, given, U), U
+
+
+@jax.jit(static_argnums=0)
+def values(known: Known, flat: Any, z: Any) -> tuple[Any, Any]:
+    """Return σ and the constraints c ≤ 0 (m,) for scaled inputs z (N·nu,)."""
+    problem, given, path, X, U = _unpacked(known, flat, z)
+    stages = jax.vmap(lambda x, u: _on_stage(problem, path, x, u))(X[:-1], U)
+    c = jnp.concatenate([stages.ravel(), _at_end(problem, X[-1])])
+    return _cost(problem, given, X, U), c
+
+
+def _sensitivities(problem: Problem, X: Any, U: Any) -> tuple[Any, Any, Any]:
+    """Return A_k, and ∂x_k/∂z (N + 1, nx, n) and ∂u_k/∂z (N, nu, n)."""
+    N, nu = U.shape
+    A, B = jax.vmap(jax.jacfwd(problem.system.step, argnums=(0, 1)))(X[:-1], U)
+    Su = (jnp.eye(N * nu) * problem.scale).reshape(N, nu, N * nu)
+
+    def step(S: Any, stage: Any) -> tuple[Any, Any]:
+        a, forced = stage
+        S_next = a @ S + forced
+        return S_next, S_next
+
+    start = jnp.zeros((X.shape[1], N * nu))
+    _, Sx = jax.lax.scan(step, start, (A, B @ Su))
+    return A, jnp.concatenate([start[None], Sx]), Su
+
+
+@jax.jit(static_argnums=0)
+def slopes(known: Known, flat: Any, z: Any) -> tuple[Any, Any]:
+    """Return ∇σ (n,) and ∂c/∂z (m, n)."""
+    problem, given, path, X, U = _unpacked(known, flat, z)
+    _, Sx, Su = _sensitivities(problem, X, U)
+    gx, gu = jax.grad(lambda x, u: _cost(problem, given, x, u), argnums=(0, 1))(X, U)
+    gradient = jnp.einsum("kx,kxn->n", gx, Sx) + jnp.einsum("ku,kun->n", gu, Su)
+    on_stage = jax.jacfwd(lambda x, u: _on_stage(problem, path, x, u), argnums=(0, 1))
+    cx, cu = jax.vmap(on_stage)(X[:-1], U)
+    stages = (cx @ Sx[:-1] + cu @ Su).reshape(-1, z.size)
+    end = jax.jacfwd(lambda x: _at_end(problem, x))(X[-1]) @ Sx[-1]
+    return gradient, jnp.concatenate([stages, end])
+
+
+@jax.jit(static_argnums=0)
+def curvature(known: Known, flat: Any, z: Any, multipliers: Any, factor: Any) -> Any:
+    """Return factor·∇²σ + Σ_i multiplier_i ∇²c_i, (n, n)."""
+    problem, given, path, X, U = _unpacked(known, flat, z)
+    A, Sx, Su = _sensitivities(problem, X, U)
+    nx, n = X.shape[1], z.size
+    S = jnp.concatenate([Sx.reshape(-1, n), Su.reshape(-1, n)])
+    at = jnp.concatenate([X.ravel(), U.ravel()])
+    on_stages, at_end = jnp.split(multipliers, [multipliers.size - _at_end(problem, X[-1]).size])
+
+    def lagrangian(flat_plan: Any) -> Any:
+        x, u = flat_plan[: X.size].reshape(X.shape), flat_plan[X.size :].reshape(U.shape)
+        c = jax.vmap(lambda a, b: _on_stage(problem, path, a, b))(x[:-1], u).ravel()
+        return (
+            factor * _cost(problem, given, x, u) + on_stages @ c + at_end @ _at_end(problem, x[-1])
+        )
+
+    slope = jax.grad(lagrangian)(at)[: X.size].reshape(X.shape)
+
+    def back(price: Any, stage: Any) -> tuple[Any, Any]:
+        a, g = stage
+        return a.T @ price + g, price
+
+    # λ_{k+1} for k = 0 … N−1: what one unit of x_{k+1} costs from there on.
+    _, prices = jax.lax.scan(back, slope[-1], (A, slope[:-1]), reverse=True)
+
+    def bent(x: Any, u: Any, price: Any) -> Any:
+        stage = jnp.concatenate([x, u])
+        return jax.hessian(lambda w: price @ problem.system.step(w[:nx], w[nx:]))(stage)
+
+    bends = jax.vmap(bent)(X[:-1], U, prices)
+    stages = jnp.concatenate([Sx[:-1], Su], axis=1)
+    plain = S.T @ jax.hessian(lagrangian)(at) @ S
+    return plain + jnp.einsum("kin,kij,kjm->nm", stages, bends, stages)
+
+
+@jax.jit(static_argnums=0)
+def along(known: Known, flat: Any, U: Any) -> tuple[Any, Any]:
+    """Return σ and the states (N + 1, nx) along the inputs U (N, nu)."""
+    problem, given = known.unpack(flat)
+    X = _states(problem, given, U)
+    return _cost(problem, given, X, U), X
