@@ -130,7 +130,10 @@ def fit_network(
     starts = check_starts(comparisons, initial)
     settings = nonnegative("l2", l2), nonnegative("learning_rate", learning_rate)
     rounds = -(-positive_int("max_epochs", max_epochs) // CHECK_EVERY)
-    patience, batch_size = positive_int("patience", patience), positive_int("batch", batch_size)
+    patience, batch_size = (
+        positive_int("patience", patience),
+        positive_int("batch_size", batch_size),
+    )
     rng = generator(key)
     training, held_out = _split(comparisons, validation, validation_fraction, rng)
     data = pair_data(starts, training, padded_size(len(training)))

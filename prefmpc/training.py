@@ -299,6 +299,9 @@ def check_starts(comparisons: Comparisons, initial: Any) -> CostModel:
         initial = jax.tree.map(lambda leaf: leaf[None], initial)
     if not isinstance(initial, CostModel):
         raise ValueError(f"initial must be a stack of σ models, got {type(initial).__name__}")
+    # The weights of a single network may all have the same first dimension.
+    if any(getattr(m, "batch_shape", None) == () for m in getattr(initial, "models", (initial,))):
+        raise ValueError("initial must be stacked along one leading axis, got a single model")
     sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(initial)}
     if len(sizes) != 1 or not all(sizes):
         raise ValueError(f"initial must be stacked along one leading axis, got {sorted(sizes)}")

@@ -104,6 +104,7 @@ class Known:
     layout: _Layout
 
     def unpack(self, flat: Any) -> tuple[Problem, Given]:
+        """Return the problem and what is given for it."""
         leaves, at = [], 0
         for shape in self.layout.shapes:
             size = int(np.prod(shape))
