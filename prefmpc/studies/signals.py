@@ -35,8 +35,16 @@ SIGNALS_SIZES = (20, 100, 400, 1000, 4000)
 PEOPLE = {"states": QUADRATIC_Q, "outputs": np.diag([40.0, 40.0, 40.0, 0.0, 0.0, 0.0])}
 """Q of somebody who also minds velocities (case study 1), and of somebody who does not."""
 
-CASES = (("LQR", "states"), ("LQR", "outputs"), ("random inputs", "states"))
+CASES = (
+    ("LQR", "states"),
+    ("LQR", "outputs"),
+    ("random inputs", "states"),
+    ("moving starts", "states"),
+)
 """Where the trajectories of the training pairs come from, and who answers."""
+
+MOVING = np.array([0.3, 0.3, 0.3, 0.3, 0.3, 0.3])
+"""Half-widths of x(0) where masses may move at the start, as on the way of a closed loop."""
 
 LEARNERS = ("(X, U)", "(Y, U)", "(Y, ΔY, U)", "(x₀, U), told the plant", "(x₀, U)")
 TESTS = ("same x(0)", "other x(0)", "random inputs")
@@ -174,7 +182,14 @@ def _loops(system: LinearSystem, problems: Any, x0: Any, steps: int) -> Any:
     return jax.vmap(one)(problems)
 
 
-def fresh_pairs(size: int, *, key: Any, inputs: str = "LQR", same_start: bool = True) -> Trajectory:
+def fresh_pairs(
+    size: int,
+    *,
+    key: Any,
+    inputs: str = "LQR",
+    same_start: bool = True,
+    radius: np.ndarray = RADIUS,
+) -> Trajectory:
     """Return 2·size new trajectories; the pairs are 0 and 1, 2 and 3, … The input before is 0.
 
     ``inputs`` is "LQR" (two of `GAINS` random controllers, drawn as in the paper) or "random
@@ -182,7 +197,7 @@ def fresh_pairs(size: int, *, key: Any, inputs: str = "LQR", same_start: bool = 
     """
     streams = generator(key).spawn(2)
     system = oscillating_masses()
-    x0 = random_states(RADIUS, key=streams[0], shape=(size if same_start else 2 * size,))
+    x0 = random_states(radius, key=streams[0], shape=(size if same_start else 2 * size,))
     x0 = np.repeat(x0, 2, axis=0) if same_start else x0
     rest = np.zeros((2 * size, system.nu))
     if inputs == "LQR":
@@ -300,12 +315,13 @@ def signals_case(
         "alone" (cases, 3) the same for `ALONE`, "alone accuracy" (cases, 2, tests); "jerk
         accuracy" and "jerk regret" (sizes, learners) for the person who minds jerky inputs.
     """
-    streams = generator(key).spawn(6)
+    streams = generator(key).spawn(7)
     system = oscillating_masses()
     most = max(SIGNALS_SIZES)
     pools = {
-        inputs: fresh_pairs(most, key=stream, inputs=inputs)
-        for inputs, stream in zip(("LQR", "random inputs"), streams[:2], strict=True)
+        "LQR": fresh_pairs(most, key=streams[0]),
+        "random inputs": fresh_pairs(most, key=streams[1], inputs="random inputs"),
+        "moving starts": fresh_pairs(most, key=streams[6], radius=MOVING),
     }
     tests = [
         fresh_pairs(500, key=streams[2]),
@@ -317,8 +333,8 @@ def signals_case(
     lost = np.zeros(share.shape[:-1])
     alone = np.zeros((len(CASES), len(ALONE)))
     alone_share = np.zeros((len(CASES), 2, len(TESTS)))
-    for c, (inputs, who) in enumerate(CASES):
-        data = {n: asked(pools[inputs][: 2 * n], person(who)) for n in sizes}
+    for c, (source, who) in enumerate(CASES):
+        data = {n: asked(pools[source][: 2 * n], person(who)) for n in sizes}
         checks = [asked(test, person(who)) for test in tests]
         costs = [learn(name, data[n]) for n in sizes for name in learners]
         share[c] = _shares(costs, checks).reshape(share[c].shape)
