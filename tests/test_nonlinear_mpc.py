@@ -154,21 +154,28 @@ def car(solver="slsqp", **options):
     return NonlinearMPC(CAR, cost, N, constraints=LIMITS, path=lateral, solver=solver, **options)
 
 
-def pendulum(solver="slsqp", **options):
+def pendulum(solver="slsqp", horizon=N, **options):
     cost = QuadraticCost(casadi.PENDULUM_Q, casadi.PENDULUM_R)
-    return NonlinearMPC(PENDULUM, cost, N, solver=solver, **options)
+    return NonlinearMPC(PENDULUM, cost, horizon, solver=solver, **options)
 
 
 PROBLEMS = {
-    "car": (car, casadi.lane_change, casadi.lane_changes, {"reference": LANE}, 1.0),
-    "pendulum": (pendulum, casadi.swing_up, casadi.swing_ups, {}, 0.9),
+    "car": (car, N, casadi.lane_change, casadi.lane_changes, {"reference": LANE}, 1.0),
+    "pendulum": (
+        lambda solver="slsqp": pendulum(solver, 20),
+        20,
+        casadi.swing_up,
+        casadi.swing_ups,
+        {},
+        0.8,
+    ),
 }
 
 
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_optimum_is_that_of_casadi(name):
-    make, peer, draw, given_, share = PROBLEMS[name]
-    ours, theirs = {solver: make(solver) for solver in SOLVERS}, peer(N)
+    make, horizon, peer, draw, given_, share = PROBLEMS[name]
+    ours, theirs = {solver: make(solver) for solver in SOLVERS}, peer(horizon)
     states = draw(50, np.random.default_rng(2))
     same = dict.fromkeys(SOLVERS, 0)
     for i, x in enumerate(states):
@@ -347,7 +354,7 @@ def test_derivatives_are_those_of_finite_differences(name):
     else:
         controller = PROBLEMS[name][0]()
         x0 = np.array([0.3, 0.1, 0.01, 18.0]) if name == "car" else np.array([0.1, 2.0, 1, -1])
-        given_ = controller._given(x0, PROBLEMS[name][3].get("reference"), None)
+        given_ = controller._given(x0, PROBLEMS[name][4].get("reference"), None)
     program = controller._program(given_)
     rng = np.random.default_rng(5)
     z = rng.uniform(-0.3, 0.3, program.lower.size)
