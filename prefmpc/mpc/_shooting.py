@@ -119,6 +119,7 @@ def _known(layout: _Layout) -> Known:
 
 
 def packed(problem: Problem, given: Given, path: Any, horizon: int) -> tuple[Known, Any]:
+    """Return the layout of a problem and all its numbers in one array on the device."""
     # One array goes to the compiled programs: with the twenty of a problem, handing them over
     # takes longer than all that is computed.
     leaves, tree = jax.tree.flatten((problem, given))
