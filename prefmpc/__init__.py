@@ -53,6 +53,7 @@ from prefmpc.preferences import (
 )
 from prefmpc.priors import WishartPrior, blocks, bryson
 from prefmpc.selection import PriorChoice, choose_prior
+from prefmpc.separable import SeparableCost
 from prefmpc.sets import Ellipsoid, Polyhedron, SecondOrderCone
 from prefmpc.signals import SignalCost, select
 from prefmpc.systems import LinearSystem, oscillating_masses
@@ -102,6 +103,7 @@ __all__ = [
     "QuadraticPreference",
     "ReferenceTracker",
     "SecondOrderCone",
+    "SeparableCost",
     "SettlingTimePreference",
     "SignalCost",
     "StabilityCheck",

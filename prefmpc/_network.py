@@ -13,11 +13,7 @@ from prefmpc._checks import finite_array, instance, shaped
 from prefmpc._pytree import check_index
 from prefmpc.trajectories import Trajectory
 
-Over = Literal["stage", "trajectory", "peak"]
-
-PEAK_POWER = 16
-"""A peak over time is a norm of this order: smooth, and at most a quarter above the maximum of 40
-equal values."""
+Over = Literal["stage", "trajectory"]
 
 ACTIVATIONS: dict[str, Any] = {
     "softplus": jax.nn.softplus,
@@ -42,6 +38,7 @@ class StageNetwork:
         raise NotImplementedError
 
     floor: float
+    even = False
 
     def _units(self, v: Any) -> Any:
         """Return the last layer's units (..., width) for v (..., n_v)."""
@@ -90,15 +87,9 @@ class StageNetwork:
         if self.over == "trajectory":
             v = v.reshape(*v.shape[:-2], 1, -1)
         units = self._units(v)
-        pooled = _peak(units) if self.over == "peak" else units.sum(-2)
-        return pooled @ self.c + self.floor * (v * v).sum((-2, -1))
-
-
-def _peak(units: Any) -> Any:
-    """Return the peak of nonnegative units (..., N, width) over time, smooth where it is zero."""
-    largest = jax.lax.stop_gradient(jnp.max(units, axis=-2, keepdims=True)) + 1e-6
-    shares = jnp.sum((units / largest) ** PEAK_POWER, axis=-2) + 1e-30
-    return largest[..., 0, :] * shares ** (1 / PEAK_POWER)
+        if self.even:
+            units = (units + self._units(-v)) / 2
+        return (units @ self.c).sum(-1) + self.floor * (v * v).sum((-2, -1))
 
 
 def check_scale(scale: ArrayLike, over: str) -> np.ndarray:

@@ -74,8 +74,6 @@ class MLPCost(StageNetwork):
                 f"activation must be one of {get_args(MLPActivation)}, got {activation!r}"
             )
         size = check_scale(scale, over)
-        if over == "peak":
-            raise ValueError('over must be "stage" or "trajectory", peaks are for ICNNCost')
         if not len(W) == len(b) >= 1:
             raise ValueError(
                 f"W and b must hold the same number of layers, at least one, "

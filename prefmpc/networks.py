@@ -36,9 +36,6 @@ class ICNNCost(StageNetwork):
         z_1 = g(V_1 v + b_1),  z_{i+1} = g(U_i z_i + V_{i+1} v + b_{i+1}),
         σ = c·z_L + floor·‖v‖²
 
-    With ``over="peak"`` each unit of z_L counts with its peak over the stages instead of its sum:
-    a norm over time of order 16, which is convex and nondecreasing too.
-
     with a convex nondecreasing g and nonnegative U_i, c (Amos, Xu and Kolter, 2017). A sum of
     convex functions with nonnegative weights is convex, and so is g of it.
 
@@ -58,10 +55,13 @@ class ICNNCost(StageNetwork):
         g(a) = log(1 + eᵃ), max(a, 0) or max(a, 0)².
     floor : float
         Nonnegative. Positive: σ is strictly convex.
-    over : {"stage", "trajectory", "peak"}
+    over : {"stage", "trajectory"}
     bias : bool
         False: all b are 0 and stay so. With a ReLU, squared or not, σ is then 0 at the origin and
         nowhere smaller: the set point is kept, whatever is learned.
+    even : bool
+        True: z_L is averaged over v and −v. An even convex function is nowhere smaller than at
+        the origin, so that the set point is kept with biases too.
 
     Raises
     ------
@@ -78,6 +78,7 @@ class ICNNCost(StageNetwork):
     floor: float
     over: Over
     bias: bool
+    even: bool
 
     def __init__(
         self,
@@ -91,6 +92,7 @@ class ICNNCost(StageNetwork):
         floor: float = 0.0,
         over: Over = "stage",
         bias: bool = True,
+        even: bool = False,
     ) -> None:
         if activation not in get_args(Activation):
             raise ValueError(
@@ -140,6 +142,7 @@ class ICNNCost(StageNetwork):
             "floor": nonnegative("floor", floor),
             "over": over,
             "bias": bool(bias),
+            "even": bool(even),
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -179,7 +182,7 @@ class ICNNCost(StageNetwork):
         activation: Activation = "softplus",
         floor: float = 0.0,
         bias: bool = True,
-        peak: bool = False,
+        even: bool = False,
     ) -> ICNNCost:
         """Draw a stack of networks to start training from.
 
@@ -192,9 +195,7 @@ class ICNNCost(StageNetwork):
         steps : int, optional
             The network then looks at whole trajectories of so many steps, instead of stages.
         shape : leading shape of the stack.
-        activation, floor, bias : as for the class.
-        peak : bool
-            Count peaks over time, ``over="peak"``; not together with ``steps``.
+        activation, floor, bias, even : as for the class.
         """
         require_x64()
         size = np.asarray(finite_array("scale", scale, ndim=1))
@@ -210,10 +211,13 @@ class ICNNCost(StageNetwork):
             for before, after in itertools.pairwise(sizes)
         ]
         c = rng.uniform(0, 2 / sizes[-1], (*shape, sizes[-1]))
-        if peak and steps is not None:
-            raise ValueError(f"peak must be False for whole trajectories, got steps={steps}")
-        over: Over = "peak" if peak else "stage" if steps is None else "trajectory"
-        options: dict[str, Any] = {"activation": activation, "floor": floor, "bias": bias}
+        over: Over = "stage" if steps is None else "trajectory"
+        options: dict[str, Any] = {
+            "activation": activation,
+            "floor": floor,
+            "bias": bias,
+            "even": even,
+        }
         return cls(V, b, U, c, scale=size, over=over, **options)
 
 
@@ -244,7 +248,9 @@ def soft_constraints(constraints: Polyhedron, weight: ArrayLike) -> ICNNCost:
     return ICNNCost([constraints.H], [-constraints.h], [], c, scale=ones, activation="relu")
 
 
-register_pytree(ICNNCost, static=("scale", "activation", "floor", "over", "bias"))
+register_pytree(
+    ICNNCost, static=("scale", "activation", "floor", "over", "bias", "even", "separate")
+)
 
 
 def _fields(model: ICNNCost) -> dict[str, Any]:

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
+
+import numpy as np
 
 from prefmpc._checks import array_module, instance
 from prefmpc._pytree import bypass_init, register_pytree
 from prefmpc.models import CostModel
 from prefmpc.trajectories import Trajectory
 
-Signal = Literal["x", "y", "du", "dy", "x_r", "u_r", "x0"]
+Name = Literal["x", "y", "du", "dy", "x_r", "u_r", "x0"]
+Signal = str
+"""A name, or some channels of one: "y", "y[0,2]"."""
+
+_CHANNELS = re.compile(r"([a-z_0]+?)(?:\[(\d+(?:,\d+)*)\])?")
 
 
 def select(trajectory: Trajectory, signals: Sequence[Signal]) -> Trajectory:
@@ -29,6 +36,7 @@ def select(trajectory: Trajectory, signals: Sequence[Signal]) -> Trajectory:
         "du" and "dy": the increments u_k − u_{k−1} and y_k − y_{k−1}; the first one is
         u_0 − u_before, and 0 if that is not known;
         "x_r" and "u_r": the set point, the same at every step;
+        a name with channels, such as "y[0,2]": these alone;
         "x0", which stands alone: σ of (x_0, U). The result has a single step, whose state is
         (x_0, u_0 … u_{N−1}) and whose input is u_0.
 
@@ -46,19 +54,30 @@ def select(trajectory: Trajectory, signals: Sequence[Signal]) -> Trajectory:
         state = xp.concatenate([plain.x[..., 0, :], steps], axis=-1)[..., None, :]
         first = plain.u[..., :1, :]
         return _view(xp, state, first)
-    parts = [_signal(name, trajectory, plain, xp) for name in names]
+    parts = [_channels(name, trajectory, plain, xp) for name in names]
     return _view(xp, xp.concatenate(parts, axis=-1), plain.u)
 
 
 def check_signals(signals: Sequence[Signal]) -> tuple[Signal, ...]:
-    """Return the names as a tuple, or raise a ValueError."""
+    """Return the signals as a tuple, or raise a ValueError."""
     names = (signals,) if isinstance(signals, str) else tuple(signals)
-    known = get_args(Signal)
-    if not names or not set(names) <= set(known) or len(set(names)) < len(names):
+    known = get_args(Name)
+    if not names or len(set(names)) < len(names) or not {_split(n)[0] for n in names} <= set(known):
         raise ValueError(f"signals must name different ones of {known}, got {signals!r}")
     if "x0" in names and len(names) > 1:
         raise ValueError(f'signals must hold "x0" alone or not at all, got {signals!r}')
-    return names  # type: ignore[return-value]
+    return names
+
+
+def _split(signal: Any) -> tuple[str, list[int] | None]:
+    """Return the name and the channels of "y[0,2]"; None for all of them."""
+    found = _CHANNELS.fullmatch(signal) if isinstance(signal, str) else None
+    if found is None:
+        return "", None
+    name, channels = found.groups()
+    if channels is None:
+        return name, None
+    return ("" if name == "x0" else name), [int(c) for c in channels.split(",")]
 
 
 def _view(xp: Any, states: Any, inputs: Any) -> Trajectory:
@@ -67,7 +86,17 @@ def _view(xp: Any, states: Any, inputs: Any) -> Trajectory:
     return bypass_init(Trajectory, x=x, u=inputs, y=states)
 
 
-def _signal(name: Signal, trajectory: Trajectory, plain: Trajectory, xp: Any) -> Any:
+def _channels(signal: Signal, trajectory: Trajectory, plain: Trajectory, xp: Any) -> Any:
+    name, channels = _split(signal)
+    values = _signal(name, trajectory, plain, xp)
+    if channels is None:
+        return values
+    if max(channels) >= values.shape[-1]:
+        raise ValueError(f"signals must name channels below {values.shape[-1]}, got {signal!r}")
+    return values[..., np.asarray(channels)]
+
+
+def _signal(name: str, trajectory: Trajectory, plain: Trajectory, xp: Any) -> Any:
     """Return one signal (..., N, n)."""
     if name == "x":
         return plain.x[..., :-1, :]

@@ -211,8 +211,6 @@ def expression(cp: Any, cost: Any, X: Any, U: Any) -> Any:
     for name, leaf in (*((f"U[{i}]", leaf) for i, leaf in enumerate(cost.U)), ("c", cost.c)):
         if not (np.asarray(leaf) >= 0).all():
             raise ValueError(f"cost must be convex, but its {name} has negative entries or NaN")
-    if cost.over == "peak":
-        raise ValueError('cost must not be over="peak" here; NonlinearMPC takes it')
     if len(cost.scale) != nx + nu:
         raise ValueError(f"cost must see {nx + nu} signals, got {len(cost.scale)}")
     nonnegative("cost.floor", cost.floor)
@@ -230,10 +228,15 @@ def expression(cp: Any, cost: Any, X: Any, U: Any) -> Any:
         "squared_relu": lambda a: cp.square(cp.pos(a)),
     }[cost.activation]
     ones = np.ones((v.shape[0], 1))
-    z = act(v @ np.asarray(cost.V[0]).T + ones @ np.asarray(cost.b[0])[None])
-    for V, b, W in zip(cost.V[1:], cost.b[1:], cost.U, strict=True):
-        z = act(z @ np.asarray(W).T + v @ np.asarray(V).T + ones @ np.asarray(b)[None])
-    total = cp.sum(z @ np.asarray(cost.c))
+
+    def units(v: Any) -> Any:
+        z = act(v @ np.asarray(cost.V[0]).T + ones @ np.asarray(cost.b[0])[None])
+        for V, b, W in zip(cost.V[1:], cost.b[1:], cost.U, strict=True):
+            z = act(z @ np.asarray(W).T + v @ np.asarray(V).T + ones @ np.asarray(b)[None])
+        return z
+
+    last = (units(v) + units(-v)) / 2 if cost.even else units(v)
+    total = cp.sum(last @ np.asarray(cost.c))
     return total + cost.floor * cp.sum_squares(v) if cost.floor else total
 
 
