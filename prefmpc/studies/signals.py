@@ -155,9 +155,11 @@ def weight_loops(
 
     The input before the first one is 0. Raises a RuntimeError if a problem is not solved.
     """
-    problems = [input_problem(W, system.nx + system.nu, system.u_max) for W in weights]
+    count = len(weights)
+    filled = [*weights, *[weights[-1]] * (-count % 8)]  # few shapes to compile
+    problems = [input_problem(W, system.nx + system.nu, system.u_max) for W in filled]
     stack = jax.tree.map(lambda *leaves: np.stack(leaves), *problems)
-    x, u = (np.asarray(part) for part in _loops(system, stack, x0, steps))
+    x, u = (np.asarray(part)[:count] for part in _loops(system, stack, x0, steps))
     if not np.isfinite(u).all():
         raise RuntimeError("a closed loop met an MPC problem that was not solved")
     rest = np.zeros((*u.shape[:2], system.nu))
