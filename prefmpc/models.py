@@ -35,10 +35,11 @@ class CostModel(Protocol):
     trajectories enters the loss as one difference of features.
     """
 
-    linear_in_features: bool
+    @property
+    def linear_in_features(self) -> bool:
+        """Whether σ of a difference of features is the difference of σ."""
 
-    @staticmethod
-    def features(trajectory: Trajectory) -> Any:
+    def features(self, trajectory: Trajectory) -> Any:
         """Everything that σ needs of a trajectory; computed once, outside the training loop."""
 
     def score(self, features: Any) -> Any:

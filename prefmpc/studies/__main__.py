@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from prefmpc.studies import (
+    lane,
     measures,
     onesided,
     priors,
@@ -108,6 +109,11 @@ STUDIES: dict[str, Study] = {
             **{"learners": signals.LEARNERS, "tests": signals.TESTS, "alone": signals.ALONE},
             **{"jerk sizes": signals.JERK_SIZES, "jerk learners": signals.JERK_LEARNERS},
         },
+    ),
+    "lane": (
+        lane.lane_case,
+        "extensions/lane_spread.json",
+        {"answers": lane.ANSWERS, "learners": lane.LANE_LEARNERS, "signals": lane.LANE_SIGNALS},
     ),
     "measures": (
         measures.measures_case,
