@@ -141,7 +141,10 @@ LAYERS = {
     "nonlinear": HELPERS | {"systems"},
     "plants": HELPERS | {"nonlinear"},
     "early_stopping": HELPERS | {"trajectories", "models", "comparisons", "losses", "training"},
-    "mpc": HELPERS | {"systems", "nonlinear", "sets", "trajectories", "models", "networks", "mpc"},
+    "mpc": {
+        *HELPERS,
+        *("systems", "nonlinear", "sets", "trajectories", "models", "networks", "signals", "mpc"),
+    },
     "evaluation": {
         *HELPERS,
         *("systems", "trajectories", "preferences", "comparisons", "models", "mpc"),

@@ -234,7 +234,7 @@ def tuning_cost(setting: tuple[float, ...], x0: np.ndarray) -> float:
 
 @cache
 def tuned_by_hand() -> tuple[tuple[float, ...], float]:
-    """Return the best setting of 64 on a grid and 27 finer ones around it, and its discomfort.
+    """Return the best setting of 64 on a grid and of finer ones around it, and its discomfort.
 
     All drive from the same eight states. More than a person could do: the passenger's own number
     is read, not asked for.
