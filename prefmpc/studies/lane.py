@@ -116,8 +116,9 @@ def scenarios(size: int, *, key: Any) -> np.ndarray:
 def drives(x0: np.ndarray, *, key: Any) -> Trajectory:
     """Let a different driver drive from each state (m, 4): plans and temperaments vary.
 
-    A driver has a smooth path in mind, quick or slow, early or late, and corrects what is off it
-    firmly or loosely. Drives beyond the grip of the tyres, or with a jerk above 10 m/s³, are
+    A driver has a smooth path of 1.5 to 5 s in mind, starts early or late, and corrects what is off
+    it firmly or loosely: nobody strolls, since choices between slow drives say nothing about jerk.
+    Drives beyond the grip of the tyres, or with a jerk above 10 m/s³, are
     driven again by another driver.
     """
     rng = generator(key)
@@ -138,8 +139,8 @@ def drives(x0: np.ndarray, *, key: Any) -> Trajectory:
 def _drive(x: np.ndarray, rng: np.random.Generator) -> Trajectory:
     car, m = lane_car(), len(x)
     start, v = x[:, 0].copy(), x[:, 3].copy()
-    duration, skew = rng.uniform(1, 8, m), np.exp(rng.normal(0, 0.3, m))
-    late, speed = rng.uniform(0, 0.7, m), np.exp(rng.uniform(np.log(0.8), np.log(3), m))
+    duration, skew = rng.uniform(1.5, 5, m), np.exp(rng.normal(0, 0.3, m))
+    late, speed = rng.uniform(0, 0.7, m), np.exp(rng.uniform(0, np.log(2.5), m))
     damping = 1 + 2 * rng.uniform(0.6, 1.2, m)
     states, inputs = [x], []
     for k in range(STEPS):
