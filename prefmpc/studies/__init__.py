@@ -4,7 +4,7 @@
 results that the book reads. NAME is "quadratic" and "distinct" (case study 1), "settling" and
 "ties" (case study 2), "measures" (what accuracy does not tell), "priors" and "calibration" (what a
 prior is worth), "onesided" (a person whom no quadratic represents), "references" (many set
-points), "signals" (what σ may see) or "stability".
+points), "signals" (what σ may see), "lane" (a car and its passenger) or "stability".
 """
 
 from prefmpc.studies.measures import baselines, measures_case
