@@ -248,9 +248,7 @@ def soft_constraints(constraints: Polyhedron, weight: ArrayLike) -> ICNNCost:
     return ICNNCost([constraints.H], [-constraints.h], [], c, scale=ones, activation="relu")
 
 
-register_pytree(
-    ICNNCost, static=("scale", "activation", "floor", "over", "bias", "even", "separate")
-)
+register_pytree(ICNNCost, static=("scale", "activation", "floor", "over", "bias", "even"))
 
 
 def _fields(model: ICNNCost) -> dict[str, Any]:
