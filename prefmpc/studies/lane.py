@@ -74,7 +74,7 @@ def limits() -> dict[str, Any]:
 
 
 def grip(x: Any, u: Any) -> Any:
-    """Return |lateral acceleration| − limit, from both sides; not positive where tyres hold."""
+    """Return lateral acceleration minus its limit, both ways; not positive where tyres hold."""
     lateral = lane_car().output(x)[2]
     return jnp.stack([lateral - LATERAL_LIMIT, -lateral - LATERAL_LIMIT])
 
