@@ -101,7 +101,7 @@ def _models():
                 SCALE, key=KEY, widths=(4, 3), **options
             )
     for activation in ("relu", "softplus", "squared_relu"):
-        for more in ({}, {"steps": 3}, {"peak": True}):
+        for more in ({}, {"steps": 3}, {"even": True}):
             models[f"ICNN {activation} {more}"] = ICNNCost.random(
                 SCALE, key=KEY, widths=(4, 3), activation=activation, floor=0.1, **more
             )
@@ -164,7 +164,7 @@ ONE = {"W": [np.ones((2, 3))], "b": [np.zeros(2)], "c": np.ones(2)}
     [
         (lambda: MLPCost(**ONE, scale=SCALE, activation="sine"), "activation must be one of"),
         (lambda: MLPCost(**ONE, scale=SCALE, over="time"), "over must be one of"),
-        (lambda: MLPCost(**ONE, scale=SCALE, over="peak"), 'over must be "stage" or "trajectory"'),
+        (lambda: MLPCost(**ONE, scale=SCALE, over="peak"), "over must be one of"),
         (lambda: MLPCost(**ONE, scale=-SCALE), "scale must hold positive numbers"),
         (lambda: MLPCost(**ONE, scale=[1.0, 1]), "columns, the entries of v, got 3"),
         (lambda: MLPCost(**ONE, scale=[1.0, 1], over="trajectory"), "must have a multiple of 2"),
