@@ -21,6 +21,8 @@ NEWTON_STEPS = 60
 SHORTEST = 1e-3
 """Newton steps that have to be shorter than this fraction lead nowhere."""
 
+REMEMBERED = 4
+
 
 @dataclasses.dataclass(frozen=True)
 class Program:
@@ -41,6 +43,24 @@ class Program:
     lower: np.ndarray
     upper: np.ndarray
     rows: int
+
+
+def remembered(function: Callable[[np.ndarray], Any]) -> Callable[[np.ndarray], Any]:
+    """Return the function of z, which looks up its latest answers instead of computing them again.
+
+    Who chooses where to start, the solvers and the check at the end ask about the same points.
+    """
+    answers: dict[bytes, Any] = {}
+
+    def ask(z: np.ndarray) -> Any:
+        point = z.tobytes()
+        if point not in answers:
+            if len(answers) == REMEMBERED:
+                del answers[next(iter(answers))]
+            answers[point] = function(z)
+        return answers[point]
+
+    return ask
 
 
 @dataclasses.dataclass(frozen=True)
@@ -234,33 +254,22 @@ def quadratic_program(
 def _slsqp(
     program: Program, start: np.ndarray, max_iterations: int
 ) -> tuple[np.ndarray, bool, int]:
-    last: dict[str, Any] = {}
-
     def values(z: np.ndarray) -> tuple[float, np.ndarray]:
-        if "z" not in last or not np.array_equal(z, last["z"]):
-            f, c = program.values(z)
-            bad = not (np.isfinite(f) and np.isfinite(c).all())
-            # A trial step that leaves the numbers is only too long.
-            last.update(z=z.copy(), f=HUGE if bad else f, c=np.zeros_like(c) if bad else c)
-            last.pop("slopes", None)
-        return last["f"], last["c"]
-
-    def slopes(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        values(z)
-        if "slopes" not in last:
-            last["slopes"] = program.slopes(z)
-        return last["slopes"]
+        f, c = program.values(z)
+        if np.isfinite(f) and np.isfinite(c).all():
+            return f, c
+        return HUGE, np.zeros_like(c)  # a trial step that leaves the numbers is only too long
 
     size = 1 + abs(values(start)[0])
     constraints = []
     if program.rows:
         constraints = [
-            {"type": "ineq", "fun": lambda z: -values(z)[1], "jac": lambda z: -slopes(z)[1]}
+            {"type": "ineq", "fun": lambda z: -values(z)[1], "jac": lambda z: -program.slopes(z)[1]}
         ]
     found = minimize(
         lambda z: values(z)[0] / size,
         start,
-        jac=lambda z: slopes(z)[0] / size,
+        jac=lambda z: program.slopes(z)[0] / size,
         bounds=list(zip(program.lower, program.upper, strict=True)),
         constraints=constraints,
         method="SLSQP",
@@ -275,28 +284,19 @@ def _ipopt(
     import ipyopt
 
     n, m = start.size, program.rows
-    last: dict[str, Any] = {}
     count = [0]
 
-    def cached(name: str, z: np.ndarray) -> Any:
-        if "z" not in last or not np.array_equal(z, last["z"]):
-            last.clear()
-            last["z"] = z.copy()
-        if name not in last:
-            last[name] = getattr(program, name)(last["z"])
-        return last[name]
-
     def value(z: np.ndarray) -> float:
-        return float(cached("values", z)[0])
+        return program.values(z)[0]
 
     def gradient(z: np.ndarray, out: np.ndarray) -> None:
-        out[:] = cached("slopes", z)[0]
+        out[:] = program.slopes(z)[0]
 
     def limits(z: np.ndarray, out: np.ndarray) -> None:
-        out[:] = cached("values", z)[1]
+        out[:] = program.values(z)[1]
 
     def jacobian(z: np.ndarray, out: np.ndarray) -> None:
-        out[:] = cached("slopes", z)[1].ravel()
+        out[:] = program.slopes(z)[1].ravel()
 
     lower_rows, lower_columns = np.tril_indices(n)
 

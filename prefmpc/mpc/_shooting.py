@@ -88,6 +88,14 @@ def _at_end(problem: Problem, x: Any) -> Any:
     return jnp.concatenate(rows) if rows else jnp.zeros(0)
 
 
+def rows(problem: Problem, path: Any, horizon: int) -> int:
+    """Return the number of constraints."""
+    sizes = problem.system.nx, problem.system.nu
+    x, u = (jax.ShapeDtypeStruct((size,), np.float64) for size in sizes)
+    stage = jax.eval_shape(lambda x, u: _on_stage(problem, path, x, u), x, u)
+    return horizon * stage.size + jax.eval_shape(lambda x: _at_end(problem, x), x).size
+
+
 class _Layout(NamedTuple):
     """How one vector holds a problem and what is given; and the parts that are not numbers."""
 

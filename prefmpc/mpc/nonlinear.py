@@ -15,7 +15,7 @@ from prefmpc._pytree import bypass_init
 from prefmpc.models import CostModel
 from prefmpc.mpc import _nlp
 from prefmpc.mpc import _shooting as shooting
-from prefmpc.mpc._shooting import Given, Problem
+from prefmpc.mpc._shooting import Given, Known, Problem
 from prefmpc.mpc.solution import (
     Controller,
     MPCSolution,
@@ -103,6 +103,7 @@ class NonlinearMPC(Controller):
             function("path", path)
             _check_path(path, system)
         self._problem = self._sets(constraints, terminal)
+        self._rows = shooting.rows(self._problem, path, self.horizon)
         self.reset()
         self._check_cost()
 
@@ -173,8 +174,8 @@ class NonlinearMPC(Controller):
         """
         state = check_single_state(x0, self.system.nx)
         began = time.perf_counter()
-        given = self._given(state, reference, u_before)
-        program = self._program(given)
+        packed = self._packed(state, reference, u_before)
+        program = self._program(*packed)
         tries = []
         message = ""
         for guess in self._starts(program, reference, start):
@@ -198,9 +199,9 @@ class NonlinearMPC(Controller):
                 )
                 if tries[-1].good(FEASIBLE, self.tol):
                     break
-        return self._solution(given, tries, message, began)
+        return self._solution(packed, reference, tries, message, began)
 
-    def _given(self, x0: np.ndarray, reference: Any, u_before: Any) -> Given:
+    def _packed(self, x0: np.ndarray, reference: Any, u_before: Any) -> tuple[Known, Any]:
         values = None
         if reference is not None:
             check_reference(reference, self.system, self._constraints, self._ingredients)
@@ -210,7 +211,8 @@ class NonlinearMPC(Controller):
         if u_before is not None:
             before = np.asarray(finite_array("u_before", u_before, ndim=1))
             shaped("u_before", before, (self.system.nu,), "the system's inputs")
-        return Given(x0, values, before)
+        given = Given(x0, values, before)
+        return shooting.packed(self._problem, given, self._path, self.horizon)
 
     def _check_on_path(self, reference: SteadyState) -> None:
         if self._path is None:
@@ -242,15 +244,16 @@ class NonlinearMPC(Controller):
         ranked = sorted(guesses, key=merit)
         return ranked[:2] if len(ranked) > 1 else ranked
 
-    def _program(self, given: Given) -> _nlp.Program:
-        layout, flat = shooting.packed(self._problem, given, self._path, self.horizon)
+    def _program(self, layout: Known, flat: Any) -> _nlp.Program:
         scale = self._problem.scale
         low, high = (np.tile(b, self.horizon) for b in (self.system.u_min, self.system.u_max))
 
+        @_nlp.remembered
         def values(z: np.ndarray) -> tuple[float, np.ndarray]:
             f, c = shooting.values(layout, flat, z)
             return float(f), np.asarray(c)
 
+        @_nlp.remembered
         def slopes(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             g, J = shooting.slopes(layout, flat, z)
             return np.asarray(g), np.asarray(J)
@@ -258,11 +261,15 @@ class NonlinearMPC(Controller):
         def curvature(z: np.ndarray, multipliers: np.ndarray, factor: float) -> np.ndarray:
             return np.asarray(shooting.curvature(layout, flat, z, multipliers, factor))
 
-        rows = values(np.zeros(scale.size))[1].size
-        return _nlp.Program(values, slopes, curvature, low / scale, high / scale, rows)
+        return _nlp.Program(values, slopes, curvature, low / scale, high / scale, self._rows)
 
     def _solution(
-        self, given: Given, tries: list[_nlp.Attempt], message: str, began: float
+        self,
+        packed: tuple[Known, Any],
+        reference: SteadyState | None,
+        tries: list[_nlp.Attempt],
+        message: str,
+        began: float,
     ) -> MPCSolution:
         N, nu = self.horizon, self.system.nu
         good = tries[-1] if tries and tries[-1].good(FEASIBLE, self.tol) else None
@@ -274,7 +281,7 @@ class NonlinearMPC(Controller):
             message = "a local minimum"
             z = (good.z * self._problem.scale).reshape(N, nu)
             U = np.clip(z, self.system.u_min, self.system.u_max)
-            f, x = shooting.along(*shooting.packed(self._problem, given, self._path, N), U)
+            f, x = shooting.along(*packed, U)
             cost, X = float(f), np.array(x)
             self._plan = U
         elif best is None:
@@ -300,9 +307,7 @@ class NonlinearMPC(Controller):
             residual=best.residual if best is not None else np.inf,
             seconds=time.perf_counter() - began,
         )
-        if given.reference is None:
-            return solution
-        return with_reference(solution, SteadyState(*given.reference))
+        return solution if reference is None else with_reference(solution, reference)
 
 
 def _need_ipopt() -> None:
