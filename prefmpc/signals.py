@@ -11,7 +11,7 @@ import numpy as np
 
 from prefmpc._checks import array_module, instance
 from prefmpc._pytree import bypass_init, register_pytree
-from prefmpc.models import CostModel, SumCost
+from prefmpc.models import CostModel
 from prefmpc.trajectories import Trajectory
 
 Name = Literal["x", "y", "du", "dy", "x_r", "u_r", "x0"]
@@ -180,12 +180,3 @@ class SignalCost:
 
 
 register_pytree(SignalCost, static=("signals",))
-
-
-def sees_increments(cost: CostModel) -> bool:
-    """Whether σ may depend on the input before the first one: "du" is among its signals."""
-    if isinstance(cost, SumCost):
-        return any(sees_increments(model) for model in cost.models)
-    if isinstance(cost, SignalCost):
-        return any(_split(signal)[0] == "du" for signal in cost.signals)
-    return not type(cost).__module__.startswith("prefmpc.")

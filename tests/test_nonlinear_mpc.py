@@ -255,6 +255,17 @@ def test_an_input_before_and_a_start_of_ones_own():
     u = controller(x)
     expected = cold(NonlinearMPC(CARRIAGE, cost, N), x, u_before=u)
     np.testing.assert_allclose(controller.solve(x).u, expected.u, atol=1e-6)
+    # Without an input before, the first increment is 0.
+    first = cold(controller, x)
+    assert first.cost == pytest.approx(cost(first.trajectory), rel=1e-9)
+
+
+def test_an_input_before_changes_nothing_without_increments():
+    controller, x = NonlinearMPC(CARRIAGE, QuadraticCost(np.eye(2), [[0.1]]), N), [0.5, 0.1]
+    expected = cold(controller, x).trajectory.u
+    controller.reset()
+    controller.applied(np.array([4.0]))
+    np.testing.assert_array_equal(controller.solve(x).trajectory.u, expected)
 
 
 # ---- what is not solved is said ----
@@ -344,13 +355,14 @@ def test_solves_with_networks_end_in_minima(kind):
 # ---- the programs inside ----
 
 
-@pytest.mark.parametrize("name", ["car", "pendulum", "carriage"])
+@pytest.mark.parametrize("name", ["car", "pendulum", "carriage", "carriage at first"])
 def test_derivatives_are_those_of_finite_differences(name):
-    if name == "carriage":  # as of the networks above: all that a problem may have
+    if name not in PROBLEMS:  # as of the networks above: all that a problem may have
         network = MLPCost.random([1.0, 1.0, 10.0], key=KEY, widths=(6,))
         cost = SumCost([SignalCost(QuadraticCost(np.eye(3), [[1.0]]), ["x", "du"]), network])
         controller = NonlinearMPC(CARRIAGE, cost, 4, terminal=Ellipsoid(np.eye(2), 1.0))
-        packed = controller._packed(np.array([0.5, 0.2]), None, [3.0])
+        before = [3.0] if name == "carriage" else None
+        packed = controller._packed(np.array([0.5, 0.2]), None, before)
     else:
         controller = PROBLEMS[name][0]()
         x0 = np.array([0.3, 0.1, 0.01, 18.0]) if name == "car" else np.array([0.1, 2.0, 1, -1])

@@ -143,7 +143,7 @@ LAYERS = {
     "early_stopping": HELPERS | {"trajectories", "models", "comparisons", "losses", "training"},
     "mpc": {
         *HELPERS,
-        *("systems", "nonlinear", "sets", "trajectories", "models", "networks", "signals", "mpc"),
+        *("systems", "nonlinear", "sets", "trajectories", "models", "networks", "mpc"),
     },
     "evaluation": {
         *HELPERS,

@@ -33,7 +33,7 @@ class Problem(NamedTuple):
 
 
 class Given(NamedTuple):
-    """What changes from solve to solve."""
+    """What changes from solve to solve; NaN for an input before that is not known."""
 
     x0: Any
     reference: Any
@@ -56,8 +56,8 @@ def _cost(problem: Problem, given: Given, X: Any, U: Any) -> Any:
     names = ("x_r", "u_r", "y_r")
     optional = {} if given.reference is None else dict(zip(names, given.reference, strict=True))
     optional = {name: jnp.asarray(value) for name, value in optional.items()}
-    if given.before is not None:
-        optional["u_before"] = jnp.asarray(given.before)
+    # Where it is not known the first increment is 0.
+    optional["u_before"] = jnp.where(jnp.isnan(given.before), U[0], given.before)
     y = problem.system.output(X[:-1])
     total = problem.cost(bypass_init(Trajectory, x=X, u=U, y=y, **optional))
     if problem.final is not None:

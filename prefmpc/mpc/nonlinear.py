@@ -26,7 +26,6 @@ from prefmpc.mpc.solution import (
 from prefmpc.mpc.steady import SteadyState, check_reference, with_reference
 from prefmpc.mpc.terminal import TerminalIngredients
 from prefmpc.sets import Ellipsoid, Polyhedron
-from prefmpc.signals import sees_increments
 from prefmpc.systems import System
 from prefmpc.trajectories import Trajectory
 
@@ -94,7 +93,6 @@ class NonlinearMPC(Controller):
         if solver == "ipopt":
             _need_ipopt()
         self.system, self.cost = system, cost
-        self._increments = sees_increments(cost)
         self.horizon = positive_int("horizon", horizon)
         self.solver, self.tol = solver, nonnegative("tol", tol)
         self.max_iterations = positive_int("max_iterations", max_iterations)
@@ -144,7 +142,7 @@ class NonlinearMPC(Controller):
     def reset(self) -> None:
         """Forget the last plan and the last input."""
         self._plan: np.ndarray | None = None
-        self._applied: np.ndarray | None = None
+        self._applied = np.full(self.system.nu, np.nan)
 
     def applied(self, u: np.ndarray) -> None:
         """Take note of an input that the plant received: the next Δu starts there."""
@@ -207,7 +205,7 @@ class NonlinearMPC(Controller):
             check_reference(reference, self.system, self._constraints, self._ingredients)
             self._check_on_path(reference)
             values = reference.x, reference.u, reference.y
-        before = self._applied if self._increments else None
+        before = self._applied
         if u_before is not None:
             before = np.asarray(finite_array("u_before", u_before, ndim=1))
             shaped("u_before", before, (self.system.nu,), "the system's inputs")
