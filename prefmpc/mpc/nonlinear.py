@@ -305,7 +305,7 @@ class NonlinearMPC(Controller):
             residual=best.residual if best is not None else np.inf,
             seconds=time.perf_counter() - began,
         )
-        return solution if reference is None else with_reference(solution, reference)
+        return with_reference(solution, reference)
 
 
 def _need_ipopt() -> None:

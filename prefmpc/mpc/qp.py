@@ -165,7 +165,7 @@ class LinearMPC(Controller):
         self._solver.update(l=self._lower, u=self._upper)
         result = self._solver.solve(raise_error=False)
         solution = self._solution(x0, result, began)
-        return solution if reference is None else with_reference(solution, reference)
+        return with_reference(solution, reference)
 
     def _by_interior_point(self, iterations: int) -> ConeSolution:
         """Solve with Clarabel what OSQP gave up on: problems with hardly any room, as a rule."""

@@ -105,8 +105,10 @@ def check_reference(
         raise ValueError(f"reference must be a steady state, but its next state moves by {drift}")
 
 
-def with_reference(solution: MPCSolution, reference: SteadyState) -> MPCSolution:
-    """Return the same solution with the set point as a part of its plan."""
+def with_reference(solution: MPCSolution, reference: SteadyState | None) -> MPCSolution:
+    """Return the same solution with the set point, if there is one, as a part of its plan."""
+    if reference is None:
+        return solution
     T = solution.trajectory
     at = {"x_r": reference.x, "u_r": reference.u, "y_r": reference.y}
     return dataclasses.replace(
