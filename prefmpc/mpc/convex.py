@@ -19,7 +19,7 @@ from prefmpc.mpc.solution import (
     check_single_state,
 )
 from prefmpc.mpc.stability import StabilityCheck
-from prefmpc.mpc.terminal import TerminalIngredients
+from prefmpc.mpc.terminal import TerminalIngredients, terminal_set
 from prefmpc.networks import ICNNCost
 from prefmpc.sets import Ellipsoid, Polyhedron, SecondOrderCone
 from prefmpc.systems import LinearSystem
@@ -87,20 +87,14 @@ class ConvexMPC(Controller):
             check_dimension("terminal", terminal.x.size, nx)
             limits.append(X[N] == terminal.x)
             terminal = None
-        if isinstance(terminal, TerminalIngredients):
-            check_dimension("terminal", len(terminal.P), nx)
-            total += cp.sum_squares(np.linalg.cholesky(terminal.P).T @ X[N])
-            terminal = terminal.polyhedron
-        if isinstance(terminal, Ellipsoid):
-            check_dimension("terminal", terminal.dim, nx)
-            if np.isfinite(terminal.level):
-                root = np.linalg.cholesky(terminal.P).T
-                limits.append(cp.norm(root @ X[N], 2) <= np.sqrt(terminal.level))
-        elif terminal is not None:
-            instance("terminal", terminal, Polyhedron)
-            check_dimension("terminal", terminal.dim, nx)
-            if len(terminal.h):
-                limits.append(terminal.H @ X[N] <= terminal.h)
+        final, last = terminal_set(terminal, nx, ellipsoid=True)
+        if final is not None:
+            total += cp.sum_squares(np.linalg.cholesky(final).T @ X[N])
+        if isinstance(last, Ellipsoid):
+            root = np.linalg.cholesky(last.P).T
+            limits.append(cp.norm(root @ X[N], 2) <= np.sqrt(last.level))
+        elif last is not None and len(last.h):
+            limits.append(last.H @ X[N] <= last.h)
         self._program = ParametricProgram(cp.Problem(cp.Minimize(total), limits), x0, (X, U))
 
     def solve(self, x0: ArrayLike) -> MPCSolution:

@@ -19,12 +19,11 @@ from prefmpc.mpc._shooting import Given, Known, Problem
 from prefmpc.mpc.solution import (
     Controller,
     MPCSolution,
-    check_dimension,
     check_single_state,
     infeasible_message,
 )
 from prefmpc.mpc.steady import SteadyState, check_reference, with_reference
-from prefmpc.mpc.terminal import TerminalIngredients
+from prefmpc.mpc.terminal import TerminalIngredients, check_polyhedron, terminal_set
 from prefmpc.sets import Ellipsoid, Polyhedron
 from prefmpc.systems import System
 from prefmpc.trajectories import Trajectory
@@ -107,23 +106,13 @@ class NonlinearMPC(Controller):
 
     def _sets(self, constraints: Any, terminal: Any) -> Problem:
         nx, nu = self.system.nx, self.system.nu
-        stages = last = ball = final = None
+        check_polyhedron("constraints", constraints, nx + nu)
         self._constraints = constraints
-        if constraints is not None:
-            instance("constraints", constraints, Polyhedron)
-            check_dimension("constraints", constraints.dim, nx + nu)
-            stages = constraints.H, constraints.h
-        self._ingredients = isinstance(terminal, TerminalIngredients)
-        if isinstance(terminal, TerminalIngredients):
-            check_dimension("terminal", len(terminal.P), nx)
-            final, terminal = terminal.P, terminal.polyhedron
-        if isinstance(terminal, Ellipsoid):
-            check_dimension("terminal", terminal.dim, nx)
-            ball = (terminal.P, terminal.level) if np.isfinite(terminal.level) else None
-        elif terminal is not None:
-            instance("terminal", terminal, Polyhedron)
-            check_dimension("terminal", terminal.dim, nx)
-            last = terminal.H, terminal.h
+        stages = None if constraints is None else (constraints.H, constraints.h)
+        final, end = terminal_set(terminal, nx, ellipsoid=True)
+        self._ingredients = final is not None
+        last = (end.H, end.h) if isinstance(end, Polyhedron) else None
+        ball = (end.P, end.level) if isinstance(end, Ellipsoid) else None
         low, high = self.system.u_min, self.system.u_max
         half = (high - low) / 2
         scale = np.tile(np.where(np.isfinite(half), half, 1.0), self.horizon)

@@ -10,18 +10,17 @@ import numpy as np
 import scipy.sparse as sp
 from jax.typing import ArrayLike
 
-from prefmpc._checks import instance, positive_int
+from prefmpc._checks import positive_int
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc._cone import TIGHT, ConeProgram, ConeSolution, mpc_solution
 from prefmpc.mpc.solution import (
     Controller,
     MPCSolution,
-    check_dimension,
     check_problem,
     check_single_state,
 )
 from prefmpc.mpc.steady import SteadyState, check_reference, with_reference
-from prefmpc.mpc.terminal import TerminalIngredients
+from prefmpc.mpc.terminal import TerminalIngredients, check_polyhedron, terminal_set
 from prefmpc.sets import Polyhedron
 from prefmpc.systems import LinearSystem
 
@@ -81,25 +80,13 @@ class LinearMPC(Controller):
         self.system = system
         self.cost = cost
         self.horizon = positive_int("horizon", horizon)
-        final = np.zeros((system.nx, system.nx))
-        self._ingredients = isinstance(terminal, TerminalIngredients)
-        if isinstance(terminal, TerminalIngredients):
-            final, terminal = terminal.P, terminal.polyhedron
-        for name, given, dim in (
-            ("constraints", constraints, system.nx + system.nu),
-            ("terminal", terminal, system.nx),
-        ):
-            if given is None:
-                continue
-            instance(name, given, Polyhedron)
-            check_dimension(name, given.dim, dim)
-        check_dimension("terminal", len(final), system.nx)
+        check_polyhedron("constraints", constraints, system.nx + system.nu)
         self._constraints = constraints
-        self._build(constraints, terminal, final)
+        final, last = terminal_set(terminal, system.nx)
+        self._ingredients = final is not None
+        self._build(constraints, last, np.zeros((system.nx,) * 2) if final is None else final)
 
-    def _build(
-        self, constraints: Polyhedron | None, terminal: Polyhedron | None, final: np.ndarray
-    ) -> None:
+    def _build(self, constraints: Polyhedron | None, terminal: Any, final: np.ndarray) -> None:
         import osqp
 
         system, N = self.system, self.horizon

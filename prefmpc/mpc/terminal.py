@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 from scipy.optimize import linprog
@@ -36,6 +37,32 @@ class TerminalIngredients:
     ellipsoid: Ellipsoid
 
 
+def terminal_set(
+    terminal: Any, nx: int, *, ellipsoid: bool = False
+) -> tuple[np.ndarray | None, Polyhedron | Ellipsoid | None]:
+    """Return P of the terminal cost, None without ingredients, and X_N, None if that is all of ℝⁿ.
+
+    Raises a ValueError unless ``terminal`` is None, a Polyhedron, TerminalIngredients or, where
+    these will do, an Ellipsoid, and fits nx states.
+    """
+    P = None
+    if isinstance(terminal, TerminalIngredients):
+        P, terminal = terminal.P, terminal.polyhedron
+        check_dimension("terminal", len(P), nx)
+    if ellipsoid and isinstance(terminal, Ellipsoid):
+        check_dimension("terminal", terminal.dim, nx)
+        return P, terminal if np.isfinite(terminal.level) else None
+    check_polyhedron("terminal", terminal, nx)
+    return P, terminal
+
+
+def check_polyhedron(name: str, given: Any, dim: int) -> None:
+    """Raise a ValueError unless ``given`` is None or a Polyhedron of that dimension."""
+    if given is not None:
+        instance(name, given, Polyhedron)
+        check_dimension(name, given.dim, dim)
+
+
 def stage_constraints(system: System, constraints: Polyhedron | None) -> Polyhedron:
     """Return Z over the stacked (x, u): the input bounds, and ``constraints`` if there are some.
 
@@ -43,10 +70,9 @@ def stage_constraints(system: System, constraints: Polyhedron | None) -> Polyhed
     """
     box = Polyhedron.box(system.u_min, system.u_max)
     H = np.concatenate([np.zeros((len(box.h), system.nx)), box.H], axis=1)
+    check_polyhedron("constraints", constraints, system.nx + system.nu)
     if constraints is None:
         return Polyhedron(H, box.h)
-    instance("constraints", constraints, Polyhedron)
-    check_dimension("constraints", constraints.dim, system.nx + system.nu)
     return Polyhedron(np.concatenate([H, constraints.H]), np.concatenate([box.h, constraints.h]))
 
 
