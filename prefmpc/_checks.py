@@ -109,6 +109,14 @@ def nonnegative(name: str, value: Any) -> float:
     return float(value)
 
 
+def positive_vector(name: str, value: Any) -> np.ndarray:
+    """Return ``value`` as an array (n,) of positive numbers, or raise a ValueError."""
+    vector = np.asarray(finite_array(name, value, ndim=1))
+    if vector.size == 0 or (vector <= 0).any():
+        raise ValueError(f"{name} must hold positive numbers, got {vector}")
+    return vector
+
+
 def psd_matrix(name: str, value: ArrayLike, *, definite: bool = False) -> np.ndarray:
     """Return a (stack of) symmetric positive (semi)definite matrices, or raise a ValueError.
 

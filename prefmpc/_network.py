@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, Self, get_args
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, instance, shaped
-from prefmpc._pytree import check_index
+from prefmpc._checks import (
+    finite_array,
+    instance,
+    positive_int,
+    positive_vector,
+    require_x64,
+    shaped,
+)
+from prefmpc._pytree import Stack
+from prefmpc._random import generator
 from prefmpc.trajectories import Trajectory
 
 Over = Literal["stage", "trajectory"]
@@ -23,12 +32,14 @@ ACTIVATIONS: dict[str, Any] = {
 }
 
 
-class StageNetwork:
+class StageNetwork(Stack):
     """A network of v = (x_k, u_k) / scale, over single stages or all of them at once."""
 
     scale: tuple[float, ...]
     over: Over
     c: Any
+    floor: float
+    even = False
 
     linear_in_features = False
 
@@ -36,9 +47,6 @@ class StageNetwork:
     def columns(self) -> int:
         """Number of entries of v."""
         raise NotImplementedError
-
-    floor: float
-    even = False
 
     def _units(self, v: Any) -> Any:
         """Return the last layer's units (..., width) for v (..., n_v)."""
@@ -48,13 +56,6 @@ class StageNetwork:
     def batch_shape(self) -> tuple[int, ...]:
         """Leading shape of a stack of models; () for one."""
         return tuple(self.c.shape[:-1])
-
-    def __getitem__(self, index: Any) -> Self:
-        """Index the leading dimensions of a stack of models."""
-        if not self.batch_shape:
-            raise IndexError(f"a single {type(self).__name__} has no batch dimension to index")
-        check_index(index, self.batch_shape[0])
-        return jax.tree.map(lambda leaf: leaf[index], self)
 
     def __call__(self, trajectory: Trajectory) -> Any:
         """Return σ(T) for every trajectory of a batch, shape (...). For a single model."""
@@ -96,10 +97,7 @@ def check_scale(scale: ArrayLike, over: str) -> np.ndarray:
     """Return the sizes of the signals, or raise a ValueError."""
     if over not in get_args(Over):
         raise ValueError(f"over must be one of {get_args(Over)}, got {over!r}")
-    size = np.asarray(finite_array("scale", scale, ndim=1))
-    if size.size == 0 or (size <= 0).any():
-        raise ValueError(f"scale must hold positive numbers, got {size}")
-    return size
+    return positive_vector("scale", scale)
 
 
 def check_columns(name: str, columns: int, signals: int, over: str) -> None:
@@ -109,6 +107,22 @@ def check_columns(name: str, columns: int, signals: int, over: str) -> None:
             f"{name} must have {'a multiple of ' if over == 'trajectory' else ''}{signals} "
             f"columns, the entries of v, got {columns}"
         )
+
+
+def drawn_from(
+    scale: ArrayLike, widths: Sequence[int], steps: int | None, key: Any
+) -> tuple[np.ndarray, list[int], Over, np.random.Generator]:
+    """Return what random networks start with: the sizes of the signals and of all layers, v first.
+
+    Raises a ValueError if there is no layer, or a number is not positive.
+    """
+    require_x64()
+    size = np.asarray(finite_array("scale", scale, ndim=1))
+    sizes = [positive_int(f"widths[{i}]", width) for i, width in enumerate(widths)]
+    if not sizes:
+        raise ValueError("widths must name at least one layer, got none")
+    n_v = size.size if steps is None else size.size * positive_int("steps", steps)
+    return size, [n_v, *sizes], "stage" if steps is None else "trajectory", generator(key)
 
 
 def _plain(*trees: Any) -> bool:

@@ -9,9 +9,10 @@ it enters, and ``jit``, ``vmap``, ``grad`` and ``tree.map`` work on the same cla
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, TypeVar
+from typing import Any, Self, TypeVar
 
 import jax
+import numpy as np
 
 T = TypeVar("T")
 
@@ -47,10 +48,25 @@ def register_pytree(cls: type[T], static: tuple[str, ...] = ()) -> type[T]:
     return cls
 
 
-def check_index(index: Any, size: int) -> None:
-    """Raise an IndexError for a whole number outside of ``size`` entries.
+def constant_like(tree: T, value: float) -> T:
+    """Return the same tree with ``value`` for every number, for instance as a bound."""
+    return jax.tree.map(lambda leaf: np.full(leaf.shape, value), tree)
 
-    JAX clamps such an index instead, and a ``for`` loop over a stack would never end.
-    """
-    if isinstance(index, int) and not -size <= index < size:
-        raise IndexError(f"index must lie in [{-size}, {size - 1}], got {index}")
+
+class Stack:
+    """A pytree that may be a stack of many: then all leaves have leading dimensions in common."""
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading shape of a stack; () for a single one."""
+        raise NotImplementedError
+
+    def __getitem__(self, index: Any) -> Self:
+        """Index the leading dimensions of a stack."""
+        if not self.batch_shape:
+            raise IndexError(f"a single {type(self).__name__} has no batch dimension to index")
+        size = self.batch_shape[0]
+        # JAX would clamp such an index, and a ``for`` loop over a stack would never end.
+        if isinstance(index, int) and not -size <= index < size:
+            raise IndexError(f"index must lie in [{-size}, {size - 1}], got {index}")
+        return jax.tree.map(lambda leaf: leaf[index], self)

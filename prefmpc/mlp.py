@@ -7,14 +7,19 @@ import itertools
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
-import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, nonnegative, positive_int, require_x64
-from prefmpc._network import ACTIVATIONS, Over, StageNetwork, check_columns, check_scale
-from prefmpc._pytree import register_pytree
-from prefmpc._random import generator
+from prefmpc._checks import finite_array, nonnegative
+from prefmpc._network import (
+    ACTIVATIONS,
+    Over,
+    StageNetwork,
+    check_columns,
+    check_scale,
+    drawn_from,
+)
+from prefmpc._pytree import constant_like, register_pytree
 
 MLPActivation = Literal["relu", "tanh", "softplus"]
 
@@ -120,11 +125,7 @@ class MLPCost(StageNetwork):
 
     def bounds(self) -> tuple[MLPCost, MLPCost]:
         """Return infinite bounds: every weight may be anything."""
-        low, high = (
-            jax.tree.map(lambda leaf, side=side: np.full(leaf.shape, side), self)
-            for side in (-np.inf, np.inf)
-        )
-        return low, high
+        return constant_like(self, -np.inf), constant_like(self, np.inf)
 
     @classmethod
     def random(
@@ -151,21 +152,14 @@ class MLPCost(StageNetwork):
         shape : leading shape of the stack.
         activation, floor : as for the class.
         """
-        require_x64()
-        size = np.asarray(finite_array("scale", scale, ndim=1))
-        sizes = [positive_int(f"widths[{i}]", width) for i, width in enumerate(widths)]
-        if not sizes:
-            raise ValueError("widths must name at least one layer, got none")
-        n_v = size.size if steps is None else size.size * positive_int("steps", steps)
-        rng = generator(key)
+        size, sizes, over, rng = drawn_from(scale, widths, steps, key)
 
         def layer(after: int, before: int) -> np.ndarray:
             return rng.standard_normal((*shape, after, before)) * np.sqrt(2 / (after + before))
 
-        W = [layer(after, before) for before, after in itertools.pairwise([n_v, *sizes])]
-        b = [0.1 * rng.standard_normal((*shape, width)) for width in sizes]
+        W = [layer(after, before) for before, after in itertools.pairwise(sizes)]
+        b = [0.1 * rng.standard_normal((*shape, width)) for width in sizes[1:]]
         c = layer(1, sizes[-1])[..., 0, :]
-        over: Over = "stage" if steps is None else "trajectory"
         return cls(W, b, c, scale=size, activation=activation, floor=floor, over=over)
 
 

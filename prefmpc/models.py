@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any, Protocol, runtime_checkable
 
-import jax
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -19,7 +18,7 @@ from prefmpc._checks import (
     require_x64,
     shaped,
 )
-from prefmpc._pytree import bypass_init, check_index, register_pytree
+from prefmpc._pytree import Stack, bypass_init, constant_like, register_pytree
 from prefmpc.pools import random_weights
 from prefmpc.trajectories import Trajectory, second_moments
 
@@ -53,7 +52,7 @@ class CostModel(Protocol):
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
-class QuadraticCost:
+class QuadraticCost(Stack):
     """σ(T) = Σ_{k=0}^{N−1} x_kᵀ Q x_k + u_kᵀ R u_k, with Q = L Lᵀ and R likewise.
 
     Implements eq. (11) of arXiv 2511.22502. The trained weights θ are the entries of the lower
@@ -109,13 +108,6 @@ class QuadraticCost:
         """Leading shape of a stack of models; () for one."""
         return tuple(self.theta_Q.shape[:-1])
 
-    def __getitem__(self, index: Any) -> QuadraticCost:
-        """Index the leading dimensions of a stack of models."""
-        if not self.batch_shape:
-            raise IndexError("a single QuadraticCost has no batch dimension to index")
-        check_index(index, self.batch_shape[0])
-        return jax.tree.map(lambda leaf: leaf[index], self)
-
     def __call__(self, trajectory: Trajectory) -> Any:
         """Return σ(T) for every trajectory of a batch, shape (...).
 
@@ -158,8 +150,7 @@ class QuadraticCost:
             theta_Q=lower(self.theta_Q, FIRST_MIN),
             theta_R=lower(self.theta_R, DIAGONAL_MIN),
         )
-        high = jax.tree.map(lambda leaf: np.full(leaf.shape, np.inf), low)
-        return low, high
+        return low, constant_like(low, np.inf)
 
     @classmethod
     def random(

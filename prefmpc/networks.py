@@ -7,7 +7,6 @@ import itertools
 from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
-import jax
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -15,12 +14,16 @@ from prefmpc._checks import (
     finite_array,
     instance,
     nonnegative,
-    positive_int,
-    require_x64,
 )
-from prefmpc._network import ACTIVATIONS, Over, StageNetwork, check_columns, check_scale
-from prefmpc._pytree import bypass_init, register_pytree
-from prefmpc._random import generator
+from prefmpc._network import (
+    ACTIVATIONS,
+    Over,
+    StageNetwork,
+    check_columns,
+    check_scale,
+    drawn_from,
+)
+from prefmpc._pytree import bypass_init, constant_like, register_pytree
 from prefmpc.sets import Polyhedron
 
 Activation = Literal["softplus", "relu", "squared_relu"]
@@ -161,11 +164,7 @@ class ICNNCost(StageNetwork):
 
     def bounds(self) -> tuple[ICNNCost, ICNNCost]:
         """Return the bounds that keep σ convex as two models: U ≥ 0, c ≥ 0; without bias b = 0."""
-        low, high = (
-            jax.tree.map(lambda leaf, side=side: np.full(leaf.shape, side), self)
-            for side in (-np.inf, np.inf)
-        )
-        zero = jax.tree.map(lambda leaf: np.zeros(leaf.shape), self)
+        low, high, zero = (constant_like(self, value) for value in (-np.inf, np.inf, 0.0))
         held = {} if self.bias else {"b": zero.b}
         low = bypass_init(ICNNCost, **{**_fields(low), "U": zero.U, "c": zero.c, **held})
         return low, bypass_init(ICNNCost, **{**_fields(high), **held})
@@ -197,13 +196,7 @@ class ICNNCost(StageNetwork):
         shape : leading shape of the stack.
         activation, floor, bias, even : as for the class.
         """
-        require_x64()
-        size = np.asarray(finite_array("scale", scale, ndim=1))
-        sizes = [positive_int(f"widths[{i}]", width) for i, width in enumerate(widths)]
-        if not sizes:
-            raise ValueError("widths must name at least one layer, got none")
-        n_v = size.size if steps is None else size.size * positive_int("steps", steps)
-        rng = generator(key)
+        size, (n_v, *sizes), over, rng = drawn_from(scale, widths, steps, key)
         V = [rng.standard_normal((*shape, width, n_v)) / np.sqrt(n_v) for width in sizes]
         b = [bias * 0.1 * rng.standard_normal((*shape, width)) for width in sizes]
         U = [
@@ -211,7 +204,6 @@ class ICNNCost(StageNetwork):
             for before, after in itertools.pairwise(sizes)
         ]
         c = rng.uniform(0, 2 / sizes[-1], (*shape, sizes[-1]))
-        over: Over = "stage" if steps is None else "trajectory"
         options: dict[str, Any] = {
             "activation": activation,
             "floor": floor,

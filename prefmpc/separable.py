@@ -5,12 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import array_module, finite_array, instance
-from prefmpc._pytree import bypass_init, check_index, register_pytree
+from prefmpc._checks import array_module, finite_array, instance, positive_vector
+from prefmpc._pytree import Stack, constant_like, register_pytree
 from prefmpc.trajectories import Trajectory
 
 SHAPES = ("absolute", "square", "fourth")
@@ -19,7 +18,7 @@ LEAST = 1e-4
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
-class SeparableCost:
+class SeparableCost(Stack):
     """σ(T) = Σ_k Σ_i h_i(v_ki), with v_k = (x_k, u_k) / scale and one curve h_i for each signal.
 
     Each curve mixes three even, convex shapes with nonnegative weights c_1i, c_2i and c_3i:
@@ -50,9 +49,7 @@ class SeparableCost:
     linear_in_features = True
 
     def __init__(self, c: ArrayLike, *, scale: ArrayLike) -> None:
-        size = np.asarray(finite_array("scale", scale, ndim=1))
-        if size.size == 0 or (size <= 0).any():
-            raise ValueError(f"scale must hold positive numbers, got {size}")
+        size = positive_vector("scale", scale)
         weights = np.asarray(finite_array("c", c))
         if weights.shape[-2:] != (len(SHAPES), size.size):
             raise ValueError(f"c must have shape (..., 3, {size.size}), got {weights.shape}")
@@ -65,13 +62,6 @@ class SeparableCost:
     def batch_shape(self) -> tuple[int, ...]:
         """Leading shape of a stack of models; () for one."""
         return tuple(self.c.shape[:-2])
-
-    def __getitem__(self, index: Any) -> SeparableCost:
-        """Index the leading dimensions of a stack of models."""
-        if not self.batch_shape:
-            raise IndexError("a single SeparableCost has no batch dimension to index")
-        check_index(index, self.batch_shape[0])
-        return jax.tree.map(lambda leaf: leaf[index], self)
 
     def __call__(self, trajectory: Trajectory) -> Any:
         """Return σ(T) for every trajectory of a batch, shape (...)."""
@@ -104,11 +94,7 @@ class SeparableCost:
 
     def bounds(self) -> tuple[SeparableCost, SeparableCost]:
         """Return the bounds on c as two models: at least 1e-4."""
-        low, high = (
-            bypass_init(SeparableCost, c=np.full(np.shape(self.c), end), scale=self.scale)
-            for end in (LEAST, np.inf)
-        )
-        return low, high
+        return constant_like(self, LEAST), constant_like(self, np.inf)
 
     @classmethod
     def start(cls, scale: ArrayLike, *, shape: tuple[int, ...] = ()) -> SeparableCost:

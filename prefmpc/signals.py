@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from prefmpc._checks import array_module, instance
-from prefmpc._pytree import bypass_init, register_pytree
+from prefmpc._pytree import Stack, bypass_init, register_pytree
 from prefmpc.models import CostModel
 from prefmpc.trajectories import Trajectory
 
@@ -117,7 +117,7 @@ def _signal(name: str, trajectory: Trajectory, plain: Trajectory, xp: Any) -> An
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
-class SignalCost:
+class SignalCost(Stack):
     """A σ model of chosen signals and the inputs: σ(T) = model(select(T, signals)).
 
     ``SignalCost(QuadraticCost(Q, R), "y")`` is σ(Y, U) = Σ_k y_kᵀQy_k + u_kᵀRu_k.
@@ -153,10 +153,6 @@ class SignalCost:
     def batch_shape(self) -> tuple[int, ...]:
         """Leading shape of a stack of models; () for one."""
         return tuple(getattr(self.model, "batch_shape", ()))
-
-    def __getitem__(self, index: Any) -> SignalCost:
-        """Index the leading dimensions of a stack of models."""
-        return bypass_init(SignalCost, model=self.model[index], signals=self.signals)
 
     def __call__(self, trajectory: Trajectory) -> Any:
         """Return σ(T) for every trajectory of a batch, shape (...)."""

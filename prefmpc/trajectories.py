@@ -22,12 +22,12 @@ from prefmpc._checks import (
     shaped,
     to_numpy,
 )
-from prefmpc._pytree import bypass_init, check_index, register_pytree
+from prefmpc._pytree import Stack, bypass_init, register_pytree
 from prefmpc.systems import LinearSystem, System
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
-class Trajectory:
+class Trajectory(Stack):
     """One trajectory, or a batch of them: x_0 … x_N, u_0 … u_{N−1}, y_0 … y_{N−1}.
 
     Time stands before the channel and batches lead. Below eq. (1) of arXiv 2511.22502.
@@ -124,13 +124,6 @@ class Trajectory:
     def batch_shape(self) -> tuple[int, ...]:
         """Leading shape; () for a single trajectory."""
         return tuple(self.u.shape[:-2])
-
-    def __getitem__(self, index: Any) -> Trajectory:
-        """Index the leading batch dimensions."""
-        if not self.batch_shape:
-            raise IndexError("a single trajectory has no batch dimension to index")
-        check_index(index, self.batch_shape[0])
-        return jax.tree.map(lambda leaf: leaf[index], self)
 
     def __len__(self) -> int:
         """Size of the leading batch dimension."""
