@@ -109,6 +109,13 @@ def nonnegative(name: str, value: Any) -> float:
     return float(value)
 
 
+def sample_time(dt: Any) -> float:
+    """Return ``dt`` as a float, or raise a ValueError unless it is positive and finite."""
+    if not np.isfinite(dt) or dt <= 0:
+        raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
+    return float(dt)
+
+
 def positive_vector(name: str, value: Any) -> np.ndarray:
     """Return ``value`` as an array (n,) of positive numbers, or raise a ValueError."""
     vector = np.asarray(finite_array(name, value, ndim=1))

@@ -12,7 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import bounds_pair, finite_array, function, is_traced, positive_int, shaped
+from prefmpc._checks import (
+    bounds_pair,
+    finite_array,
+    function,
+    is_traced,
+    positive_int,
+    sample_time,
+    shaped,
+)
 from prefmpc._pytree import register_pytree
 from prefmpc.systems import LinearSystem, System
 
@@ -65,8 +73,7 @@ class NonlinearSystem(System):
         u_max: ArrayLike | None = None,
     ) -> None:
         nx, nu = positive_int("nx", nx), positive_int("nu", nu)
-        if not np.isfinite(dt) or dt <= 0:
-            raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
+        dt = sample_time(dt)
         function("f", f)
         output = _state_itself if g is None else g
         function("g", output)
@@ -78,7 +85,7 @@ class NonlinearSystem(System):
         ny = _shape_of("g(x)", output, x)
         if len(ny) != 1 or not ny[0]:
             raise ValueError(f"g must return an output of shape (ny,), got shape {ny}")
-        values = {"f": f, "g": output, "u_min": low, "u_max": high, "dt": float(dt)}
+        values = {"f": f, "g": output, "u_min": low, "u_max": high, "dt": dt}
         for name, value in {**values, "nx": nx, "nu": nu, "ny": int(ny[0])}.items():
             object.__setattr__(self, name, value)
 
@@ -101,8 +108,7 @@ class NonlinearSystem(System):
         as in the constructor.
         """
         function("f", f)
-        if not np.isfinite(dt) or dt <= 0:
-            raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
+        dt = sample_time(dt)
         got = _shape_of(
             "f(x, u)",
             f,
@@ -113,7 +119,7 @@ class NonlinearSystem(System):
         )
         if got != (nx,):
             raise ValueError(f"f must return ẋ, shape ({nx},), got shape {got}")
-        step = _runge_kutta(f, float(dt), positive_int("substeps", substeps))
+        step = _runge_kutta(f, dt, positive_int("substeps", substeps))
         return cls(step, g, nx=nx, nu=nu, dt=dt, u_min=u_min, u_max=u_max)
 
     def step(self, x: Any, u: Any) -> Any:

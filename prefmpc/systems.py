@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 from jax.typing import ArrayLike
 
-from prefmpc._checks import bounds_pair, finite_array, psd_matrix
+from prefmpc._checks import bounds_pair, finite_array, psd_matrix, sample_time
 from prefmpc._pytree import register_pytree
 
 if TYPE_CHECKING:
@@ -77,10 +77,9 @@ class LinearSystem(System):
         u_max: ArrayLike | None = None,
     ) -> None:
         a, b, c = _state_space(A, B, C)
-        if not np.isfinite(dt) or dt <= 0:
-            raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
+        dt = sample_time(dt)
         low, high = bounds_pair(("u_min", "u_max"), u_min, u_max, b.shape[1])
-        values = {"A": a, "B": b, "C": c, "u_min": low, "u_max": high, "dt": float(dt)}
+        values = {"A": a, "B": b, "C": c, "u_min": low, "u_max": high, "dt": dt}
         for name, value in values.items():
             object.__setattr__(self, name, value)
 
@@ -124,8 +123,7 @@ class LinearSystem(System):
         discrete matrices in its upper rows. Shapes, bounds and errors as in the constructor.
         """
         a, b, c = _state_space(A, B, C)
-        if not np.isfinite(dt) or dt <= 0:
-            raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
+        dt = sample_time(dt)
         nx, nu = b.shape
         block = np.zeros((nx + nu, nx + nu))
         block[:nx, :nx], block[:nx, nx:] = a, b
