@@ -10,14 +10,13 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from prefmpc._checks import instance, nonnegative, positive_int, require_x64, to_numpy
 from prefmpc._random import generator
 from prefmpc.comparisons import Comparisons
 from prefmpc.losses import FitError, PairData, cross_entropy, objective, padded_size, pair_data
 from prefmpc.models import CostModel
-from prefmpc.training import check_starts
+from prefmpc.training import adam, adam_step, check_starts, held_out_count
 
 CHECK_EVERY = 10
 
@@ -186,13 +185,8 @@ def _split(
     if validation is not None:
         instance("validation", validation, Comparisons)
         return comparisons, validation
-    if not 0 < nonnegative("validation_fraction", fraction) < 1:
-        raise ValueError(f"validation_fraction must lie in (0, 1), got {fraction}")
-    n = len(comparisons)
-    held = max(1, round(fraction * n))
-    if held >= n:
-        raise ValueError(f"comparisons must hold enough pairs to split for validation, got {n}")
-    order = rng.permutation(n)
+    held = held_out_count(len(comparisons), nonnegative("validation_fraction", fraction))
+    order = rng.permutation(len(comparisons))
     return comparisons.subset(order[held:]), comparisons.subset(order[:held])
 
 
@@ -219,15 +213,11 @@ def _batches(n: int, padded: int, size: int, rng: np.random.Generator) -> np.nda
     return np.concatenate(rows)
 
 
-def _adam(learning_rate: Any) -> Any:
-    return optax.adam(learning_rate, b1=0.9, b2=0.999)
-
-
 @jax.jit
 def _begin(starts: Any) -> tuple[Any, Any]:
     lower, upper = starts.bounds()
     inside = jax.tree.map(jnp.clip, starts, lower, upper)
-    return inside, jax.vmap(_adam(0.0).init)(inside)
+    return inside, jax.vmap(adam(0.0).init)(inside)
 
 
 @jax.jit
@@ -236,18 +226,14 @@ def _advance(
 ) -> tuple[Any, Any]:
     """Train for ten epochs; return the state, and the losses of trained and held-out answers."""
     l2, learning_rate = settings
-    adam = _adam(learning_rate)
 
     def one(model: Any, memory: Any) -> Any:
-        lower, upper = model.bounds()
+        bounds = model.bounds()
 
-        def step(carry: Any, chosen: Any) -> Any:
-            model, memory = carry
+        def step(carry: tuple[Any, Any], chosen: Any) -> Any:
             part = data if batches is None else _part(data, chosen)
-            slope = jax.grad(objective)(model, part, l2)
-            updates, memory = adam.update(slope, memory)
-            moved = jax.tree.map(jnp.add, model, updates)
-            return (jax.tree.map(jnp.clip, moved, lower, upper), memory), None
+            slope = jax.grad(objective)(carry[0], part, l2)
+            return adam_step(*carry, slope, bounds, learning_rate), None
 
         length = CHECK_EVERY if batches is None else None
         (model, memory), _ = jax.lax.scan(step, (model, memory), batches, length=length)

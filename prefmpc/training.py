@@ -145,7 +145,7 @@ def fit(
     """
     require_x64()
     began = time.perf_counter()
-    _check_options(comparisons, selection, validation_fraction, test)
+    held = _check_options(comparisons, selection, validation_fraction, test)
     l2, l1, tol = nonnegative("l2", l2), nonnegative("l1", l1), nonnegative("tol", tol)
     learning_rate = nonnegative("learning_rate", learning_rate)
     rng = generator(key)
@@ -155,8 +155,7 @@ def fit(
     data = pair_data(starts, comparisons, padded_size(n))
     held_out = np.zeros(0, dtype=int)
     if selection == "validation":
-        order = rng.permutation(n)
-        held_out = order[: max(1, round(validation_fraction * n))]
+        held_out = rng.permutation(n)[:held]
         weights = data.weights.copy()
         weights[held_out] = 0.0
         data = data._replace(weights=weights)
@@ -248,17 +247,28 @@ def _train(
 def _projected_adam(
     loss: Any, start: Any, lower: Any, upper: Any, steps: int, learning_rate: Any
 ) -> Any:
-    adam = optax.adam(learning_rate, b1=0.9, b2=0.999)
-
     def step(carry: tuple[Any, Any], _: None) -> tuple[tuple[Any, Any], None]:
-        model, state = carry
-        updates, state = adam.update(jax.grad(loss)(model), state)
-        moved = jax.tree.map(jnp.add, model, updates)
-        return (jax.tree.map(jnp.clip, moved, lower, upper), state), None
+        slope = jax.grad(loss)(carry[0])
+        return adam_step(*carry, slope, (lower, upper), learning_rate), None
 
     inside = jax.tree.map(jnp.clip, start, lower, upper)
-    (model, _), _ = jax.lax.scan(step, (inside, adam.init(inside)), None, length=steps)
+    carry = inside, adam(learning_rate).init(inside)
+    (model, _), _ = jax.lax.scan(step, carry, None, length=steps)
     return model
+
+
+def adam(learning_rate: Any) -> Any:
+    """Return Adam with its usual decay rates."""
+    return optax.adam(learning_rate, b1=0.9, b2=0.999)
+
+
+def adam_step(
+    model: Any, memory: Any, slope: Any, bounds: tuple[Any, Any], learning_rate: Any
+) -> tuple[Any, Any]:
+    """Take one step of Adam, projected onto the bounds; return the model and Adam's memory."""
+    updates, memory = adam(learning_rate).update(slope, memory)
+    moved = jax.tree.map(jnp.add, model, updates)
+    return jax.tree.map(jnp.clip, moved, *bounds), memory
 
 
 def _agreement(z: Any, labels: Any) -> Any:
@@ -310,9 +320,22 @@ def check_starts(comparisons: Comparisons, initial: Any) -> CostModel:
     return initial
 
 
+def held_out_count(n: int, fraction: float, advice: str = "") -> int:
+    """Return how many of n pairs are kept out of training: at least one, and not all of them."""
+    if not 0 < fraction < 1:
+        raise ValueError(f"validation_fraction must lie in (0, 1), got {fraction}")
+    count = max(1, round(fraction * n))
+    if count >= n:
+        raise ValueError(
+            f"comparisons must hold enough pairs to split for validation, got {n}{advice}"
+        )
+    return count
+
+
 def _check_options(
     comparisons: Any, selection: str, fraction: float, test: Comparisons | None
-) -> None:
+) -> int:
+    """Return the number of pairs to hold out, or raise a ValueError."""
     instance("comparisons", comparisons, Comparisons)
     if test is not None:
         instance("test", test, Comparisons)
@@ -323,11 +346,6 @@ def _check_options(
             'test must be given with selection="leaky_test_accuracy" and only then, '
             f"got selection={selection!r} and test={'None' if test is None else 'a data set'}"
         )
-    if selection == "validation":
-        if not 0 < fraction < 1:
-            raise ValueError(f"validation_fraction must lie in (0, 1), got {fraction}")
-        if len(comparisons) - max(1, round(fraction * len(comparisons))) < 1:
-            raise ValueError(
-                "comparisons must hold enough pairs to split for validation, got "
-                f'{len(comparisons)}; selection="training_loss" needs no split'
-            )
+    if selection != "validation":
+        return 0
+    return held_out_count(len(comparisons), fraction, '; selection="training_loss" needs no split')
