@@ -22,6 +22,7 @@ from prefmpc.priors import bryson
 from prefmpc.separable import SeparableCost
 from prefmpc.sets import Polyhedron
 from prefmpc.signals import SignalCost, select
+from prefmpc.studies.quadratic import ask_in_pairs
 from prefmpc.systems import System
 from prefmpc.training import fit
 from prefmpc.trajectories import Trajectory
@@ -169,8 +170,7 @@ def lane_pairs(size: int, *, key: Any) -> Comparisons:
     streams = generator(key).spawn(2)
     starts = scenarios(size, key=streams[0])
     pool = drives(np.repeat(starts, 2, axis=0), key=streams[1])
-    first = np.arange(0, 2 * size, 2)
-    return Comparisons(pool, first, first + 1, PASSENGER(pool[first], pool[first + 1]))
+    return ask_in_pairs(pool, PASSENGER)
 
 
 def fit_separable(data: Comparisons) -> SignalCost:

@@ -19,7 +19,7 @@ from prefmpc.networks import ICNNCost
 from prefmpc.pools import lqr_pool, random_states
 from prefmpc.preferences import by_criterion
 from prefmpc.priors import bryson
-from prefmpc.studies.quadratic import QUADRATIC_HORIZON, RADIUS, stacked_loops
+from prefmpc.studies.quadratic import QUADRATIC_HORIZON, RADIUS, ask_in_pairs, stacked_loops
 from prefmpc.systems import LinearSystem, oscillating_masses
 from prefmpc.training import fit
 from prefmpc.trajectories import Trajectory
@@ -65,8 +65,7 @@ def option_pairs(size: int, *, key: Any, person: Any = ONE_SIDED) -> Comparisons
         key=streams[1],
         x0=np.repeat(starts, 2, axis=0),
     )
-    first = np.arange(0, 2 * size, 2)
-    return Comparisons(pool, first, first + 1, person(pool[first], pool[first + 1]))
+    return ask_in_pairs(pool, person)
 
 
 def fit_network(data: Comparisons, *, key: Any, base: QuadraticCost | None = None) -> Any:

@@ -14,7 +14,7 @@ from prefmpc.comparisons import Comparisons
 from prefmpc.evaluation import ClosedLoops, accuracy, closed_loops
 from prefmpc.models import QuadraticCost
 from prefmpc.pools import lqr_pool, random_states
-from prefmpc.preferences import QuadraticPreference
+from prefmpc.preferences import Preference, QuadraticPreference
 from prefmpc.systems import LinearSystem, oscillating_masses
 from prefmpc.training import FitResult, Selection, best_restart, fit
 from prefmpc.trajectories import Trajectory, phi
@@ -104,6 +104,12 @@ def error_rates(models: QuadraticCost, comparisons: Comparisons) -> np.ndarray:
 def the_person() -> QuadraticPreference:
     """Return Π of case study 1."""
     return QuadraticPreference(QUADRATIC_Q, QUADRATIC_R)
+
+
+def ask_in_pairs(pool: Trajectory, person: Preference) -> Comparisons:
+    """Ask about the trajectories 0 and 1, 2 and 3, … of a pool: none comes twice."""
+    first = np.arange(0, len(pool), 2)
+    return Comparisons(pool, first, first + 1, person(pool[first], pool[first + 1]))
 
 
 def stacked_loops(

@@ -20,7 +20,7 @@ from prefmpc.pools import random_states, random_weights
 from prefmpc.preferences import by_criterion
 from prefmpc.priors import bryson
 from prefmpc.signals import SignalCost
-from prefmpc.studies.quadratic import RADIUS, solved
+from prefmpc.studies.quadratic import RADIUS, ask_in_pairs, solved
 from prefmpc.systems import LinearSystem, oscillating_masses
 from prefmpc.trajectories import Trajectory, phi
 
@@ -97,8 +97,7 @@ def options(size: int, *, key: Any, many: bool = True) -> Trajectory:
 def asked(pairs: Trajectory, person: Any) -> Comparisons:
     """Ask a person, given by a criterion, about the pairs of `options`."""
     flat = jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:]), pairs)
-    first = np.arange(0, 2 * len(pairs), 2)
-    return Comparisons(flat, first, first + 1, by_criterion(person)(flat[first], flat[first + 1]))
+    return ask_in_pairs(flat, by_criterion(person))
 
 
 # ---- who is asked ----

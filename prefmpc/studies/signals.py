@@ -25,6 +25,7 @@ from prefmpc.studies.quadratic import (
     QUADRATIC_Q,
     QUADRATIC_R,
     RADIUS,
+    ask_in_pairs,
     stacked_loops,
 )
 from prefmpc.systems import LinearSystem, oscillating_masses
@@ -225,9 +226,7 @@ def random_gains(system: LinearSystem, count: int, *, key: Any) -> np.ndarray:
 
 def asked(pool: Trajectory, criterion: Any) -> Comparisons:
     """Ask somebody who wants ``criterion`` small about the pairs of `fresh_pairs`."""
-    first = np.arange(0, len(pool), 2)
-    answer = by_criterion(criterion)
-    return Comparisons(pool, first, first + 1, answer(pool[first], pool[first + 1]))
+    return ask_in_pairs(pool, by_criterion(criterion))
 
 
 def person(who: str) -> Any:
