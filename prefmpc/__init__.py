@@ -8,16 +8,9 @@ objective of the controller.
 from prefmpc.comparisons import Comparisons
 from prefmpc.convex import Interval, MapResult, fit_map, fit_maps
 from prefmpc.early_stopping import NetworkFit, fit_network
-from prefmpc.evaluation import (
-    ClosedLoops,
-    WinRate,
-    accuracy,
-    closed_loops,
-    regret,
-    simulate,
-    win_rate,
-)
+from prefmpc.evaluation import WinRate, accuracy, regret, simulate, win_rate
 from prefmpc.global_fit import GlobalResult, fit_global
+from prefmpc.loops import ClosedLoops, closed_loops, mpc_rollout
 from prefmpc.losses import FitError
 from prefmpc.mlp import MLPCost
 from prefmpc.models import CostModel, QuadraticCost, SumCost
@@ -132,6 +125,7 @@ __all__ = [
     "logistic",
     "lqr_pool",
     "max_input",
+    "mpc_rollout",
     "one_by_one",
     "oscillating_masses",
     "phi",

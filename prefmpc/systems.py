@@ -6,12 +6,13 @@ import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 import scipy.linalg
 from jax.typing import ArrayLike
 
 from prefmpc._checks import bounds_pair, finite_array, psd_matrix, sample_time
-from prefmpc._pytree import register_pytree
+from prefmpc._pytree import Stack, register_pytree
 
 if TYPE_CHECKING:
     import control
@@ -37,7 +38,7 @@ class System:
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
-class LinearSystem(System):
+class LinearSystem(System, Stack):
     """The discrete-time plant x⁺ = A x + B u, y = C x with u_min ≤ u ≤ u_max.
 
     Implements eq. (8) of arXiv 2511.22502.
@@ -85,11 +86,40 @@ class LinearSystem(System):
 
     def step(self, x: Any, u: Any) -> Any:
         """Return x⁺ = A x + B u, shape (..., nx)."""
-        return x @ self.A.T + u @ self.B.T
+        return x @ self.A.swapaxes(-1, -2) + u @ self.B.swapaxes(-1, -2)
 
     def output(self, x: Any) -> Any:
         """Return y = C x, shape (..., ny)."""
-        return x @ self.C.T
+        return x @ self.C.swapaxes(-1, -2)
+
+    @classmethod
+    def stack(cls, systems: Sequence[LinearSystem]) -> LinearSystem:
+        """Return c plants of the same size and sample time as one, with a leading axis.
+
+        For studies of many plants at once: `closed_loops` and `BatchedMPC` take such a stack, and
+        ``step`` and ``output`` then take x (c, m, nx) and u (c, m, nu).
+        """
+        systems = list(systems)
+        if not systems:
+            raise ValueError("systems must hold at least one LinearSystem, got none")
+        for system in systems:
+            if not isinstance(system, LinearSystem) or system.batch_shape:
+                raise ValueError(f"systems must hold single LinearSystems, got {system!r}")
+        kinds = {(s.A.shape, s.B.shape, s.C.shape, s.dt) for s in systems}
+        if len(kinds) > 1:
+            raise ValueError(f"systems must agree in all shapes and in dt, got {sorted(kinds)}")
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *systems)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """(c,) for a stack of c plants, () for a single one."""
+        return tuple(self.A.shape[:-2])
+
+    def __len__(self) -> int:
+        """Return the number of plants in a stack."""
+        if not self.batch_shape:
+            raise TypeError("a single plant has no length")
+        return self.batch_shape[0]
 
     @property
     def nx(self) -> int:  # type: ignore[override]

@@ -20,7 +20,7 @@ from prefmpc import (
     oscillating_masses,
     random_states,
 )
-from prefmpc.mpc import _cone, batched, qp
+from prefmpc.mpc import _batched_qp, _cone, _interior, qp
 from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
 KEY = jax.random.key(2000)
@@ -276,8 +276,9 @@ def test_too_few_iterations_are_never_silent(monkeypatch):
 
 
 def test_unsolved_states_of_a_batch_are_nan_and_the_others_are_not(monkeypatch):
-    monkeypatch.setattr(batched, "GRADIENT_STEPS", 0)
-    monkeypatch.setattr(batched, "ACTIVE_SET_STEPS", 0)
+    monkeypatch.setattr(_batched_qp, "ACTIVE_SET_STEPS", 0)
+    monkeypatch.setattr(_batched_qp, "POLISHING_STEPS", 0)
+    monkeypatch.setattr(_interior, "LIMIT", 1)
     # A horizon that no other test uses, so that nothing compiled before is used again.
     controller = BatchedMPC(MASSES, PAPER, 7)
     states = np.stack([0.01 * RADIUS, 20 * RADIUS])  # the start is optimal without bounds
@@ -287,7 +288,7 @@ def test_unsolved_states_of_a_batch_are_nan_and_the_others_are_not(monkeypatch):
     np.testing.assert_array_equal(np.isnan(answer.u).any(axis=-1), [False, True])
     assert np.isnan(answer.cost[1])
     assert np.isfinite(answer.cost[0])
-    with pytest.raises(MPCError, match="1 of 2 problems not solved"):
+    with pytest.raises(MPCError, match="of 2 problems 1 max_iterations"):
         controller(states)
 
 
@@ -334,7 +335,7 @@ def test_bad_input_of_both_is_named(controller, call, words):
         (lambda: BatchedMPC(MASSES, STACK, 2).solve(np.ones((2, 4, 6))), "x0 must have 3 rows"),
         (
             lambda: BatchedMPC(MASSES, jax.tree.map(lambda leaf: leaf[None], STACK), 2),
-            "cost must be one model or a stack along one axis",
+            "cost must be a single one or a stack along one axis",
         ),
     ],
 )

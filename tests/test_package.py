@@ -145,6 +145,11 @@ LAYERS = {
         *HELPERS,
         *("systems", "nonlinear", "sets", "trajectories", "models", "networks", "mpc"),
     },
+    "_sharding": HELPERS,
+    "loops": {
+        *HELPERS,
+        *("_sharding", "systems", "sets", "trajectories", "models", "mpc"),
+    },
     "evaluation": {
         *HELPERS,
         *("systems", "trajectories", "preferences", "comparisons", "models", "mpc"),
@@ -163,7 +168,7 @@ LAYERS = {
             "training",
         ),
         *("priors", "convex", "uncertainty", "selection"),
-        *("mpc", "evaluation", "studies"),
+        *("mpc", "evaluation", "loops", "studies"),
     },
     "plots": set(),
 }

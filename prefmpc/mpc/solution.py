@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, shaped
+from prefmpc._checks import finite_array, is_traced, shaped
 from prefmpc._pytree import bypass_init
 from prefmpc.models import QuadraticCost
 from prefmpc.systems import LinearSystem
@@ -98,7 +98,8 @@ def check_problem(system: Any, cost: Any) -> None:
             f"cost must weigh {system.nx} states and {system.nu} inputs like the system, "
             f"got {sizes[0]} and {sizes[1]}"
         )
-    if not (np.isfinite(cost.theta_Q).all() and np.isfinite(cost.theta_R).all()):
+    weights = cost.theta_Q, cost.theta_R
+    if not any(map(is_traced, weights)) and not all(np.isfinite(w).all() for w in weights):
         raise ValueError("cost must have finite weights, got NaN or infinite ones")
 
 

@@ -9,7 +9,8 @@ import numpy as np
 
 from prefmpc._random import generator
 from prefmpc.comparisons import Comparisons
-from prefmpc.evaluation import accuracy, closed_loops, regret, win_rate
+from prefmpc.evaluation import accuracy, regret, win_rate
+from prefmpc.loops import closed_loops
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc import BatchedMPC
 from prefmpc.pools import lqr_pool, random_states

@@ -14,7 +14,7 @@ from prefmpc.convex import fit_map
 from prefmpc.evaluation import accuracy, simulate
 from prefmpc.models import QuadraticCost, SumCost
 from prefmpc.mpc import ConvexMPC
-from prefmpc.mpc.batched import responses
+from prefmpc.mpc._condensed import responses
 from prefmpc.networks import ICNNCost
 from prefmpc.pools import lqr_pool, random_states
 from prefmpc.preferences import by_criterion
@@ -117,7 +117,7 @@ def fit_offset(data: Comparisons) -> QuadraticCost:
 def person_loops(system: LinearSystem, x0: np.ndarray, steps: int) -> Trajectory:
     """Run the MPC that minimises `one_sided` itself: what the best learner could do."""
     N = QUADRATIC_HORIZON
-    Phi, Gamma = (np.asarray(part) for part in responses(system, N))
+    Phi, Gamma = (np.asarray(part)[:-1] for part in responses(system, N))
     Phi, Gamma = Phi[:, :3], Gamma[:, :3].reshape(3 * N, -1)
     L = 2 * WALL_SIDE * np.linalg.norm(Gamma, 2) ** 2 + 2 * EFFORT
     low, high = np.tile(system.u_min, N), np.tile(system.u_max, N)

@@ -11,7 +11,8 @@ import numpy as np
 
 from prefmpc._random import generator
 from prefmpc.comparisons import Comparisons
-from prefmpc.evaluation import ClosedLoops, accuracy, closed_loops
+from prefmpc.evaluation import accuracy
+from prefmpc.loops import ClosedLoops, closed_loops
 from prefmpc.models import QuadraticCost
 from prefmpc.pools import lqr_pool, random_states
 from prefmpc.preferences import Preference, QuadraticPreference

@@ -12,7 +12,8 @@ from prefmpc._random import generator
 from prefmpc.comparisons import Comparisons
 from prefmpc.convex import fit_map
 from prefmpc.early_stopping import fit_network
-from prefmpc.evaluation import accuracy, closed_loops
+from prefmpc.evaluation import accuracy
+from prefmpc.loops import closed_loops
 from prefmpc.mlp import MLPCost
 from prefmpc.models import QuadraticCost, SumCost
 from prefmpc.mpc import SteadyState

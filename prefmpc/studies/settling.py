@@ -10,7 +10,8 @@ import numpy as np
 
 from prefmpc._random import generator
 from prefmpc.comparisons import Comparisons
-from prefmpc.evaluation import accuracy, closed_loops
+from prefmpc.evaluation import accuracy
+from prefmpc.loops import closed_loops
 from prefmpc.models import QuadraticCost
 from prefmpc.pools import lqr_pool, random_states
 from prefmpc.preferences import (
@@ -158,10 +159,11 @@ def settling_case(
     # Every simulation of the rows "Random" has a controller of its own.
     coupled = QuadraticCost.random(system.nx, system.nu, key=key_random, shape=(loops,))
     diagonal = QuadraticCost(*diagonal_weights(key_random, loops))
-    settings = {"horizon": SETTLING_HORIZON, "steps": SETTLING_STEPS}
-    many = stacked_loops(system, learned, x0, **settings)
+    N, steps = SETTLING_HORIZON, SETTLING_STEPS
+    many = stacked_loops(system, learned, x0, horizon=N, steps=steps)
     pairs = jax.tree.map(lambda *leaves: np.concatenate(leaves), coupled, diagonal)
-    each = solved(closed_loops(system, pairs, np.tile(x0, (2, 1))[:, None], **settings))
+    states = np.tile(x0, (2, 1))[:, None]
+    each = solved(closed_loops(system, pairs, states, horizon=N, steps=steps))
 
     random = {
         "Random": each[:loops, 0],

@@ -14,7 +14,8 @@ from prefmpc.comparisons import Comparisons
 from prefmpc.convex import fit_map
 from prefmpc.evaluation import accuracy
 from prefmpc.models import QuadraticCost
-from prefmpc.mpc.batched import CondensedProblem, responses, solve_box
+from prefmpc.mpc._batched_qp import SOLVED, solve
+from prefmpc.mpc._condensed import CondensedProblem, responses, scaled
 from prefmpc.pools import random_states, random_weights
 from prefmpc.preferences import by_criterion
 from prefmpc.priors import WishartPrior, bryson
@@ -83,7 +84,7 @@ def trajectory_rows(
     For "x", "y", "du" and "dy", in the order of `prefmpc.select`.
     """
     nx, nu = system.nx, system.nu
-    Phi, Gamma = (np.asarray(part) for part in responses(system, horizon))
+    Phi, Gamma = (np.asarray(part)[:-1] for part in responses(system, horizon))
     X = np.concatenate([Phi, np.zeros((horizon, nx, nu)), Gamma], axis=2)
     U = np.eye(nu + horizon * nu).reshape(horizon + 1, nu, -1)
     U = np.concatenate([np.zeros((horizon + 1, nu, nx)), U], axis=2)
@@ -117,30 +118,18 @@ def learned_weights(cost: QuadraticCost, nx: int) -> np.ndarray:
 
 def input_problem(W: np.ndarray, n: int, u_max: np.ndarray) -> CondensedProblem:
     """Return min vᵀWv over abs(U) ≤ u_max for v = (what is given (n,), U): no plant is needed."""
-    H, F = 2 * W[n:, n:], 2 * W[n:, :n]
-    scale = 1 / np.sqrt(np.diag(H))
-    H = (H * scale).T * scale
-    values, vectors = np.linalg.eigh((H + H.T) / 2)
-    upper = np.tile(u_max, len(H) // len(u_max)) / scale
-    return CondensedProblem(
-        H=(H + H.T) / 2,
-        F=F * scale[:, None],
-        scale=scale,
-        inverse=(vectors / values) @ vectors.T,
-        largest=values[-1],
-        smallest=values[0],
-        lower=-upper,
-        upper=upper,
-    )
+    upper = np.tile(u_max, (len(W) - n) // len(u_max))
+    return scaled(2 * W[n:, n:], 2 * W[n:, :n], -upper, upper)
 
 
 def plans(W: np.ndarray, given: np.ndarray, system: LinearSystem) -> np.ndarray:
     """Return the plans U (m, N, nu) that minimise vᵀWv for every row of ``given`` (m, n)."""
     problem = input_problem(W, given.shape[-1], system.u_max)
-    U, done, *_ = jax.jit(solve_box)(problem, given, PRECISION)
-    if not np.all(done):
+    single = jax.tree.map(lambda leaf: leaf[None], problem)
+    answer = jax.jit(solve)(single, given[None], PRECISION)
+    if not np.all(answer.status == SOLVED):
         raise RuntimeError("a plan was not solved")
-    return np.asarray(U).reshape(len(given), -1, system.nu)
+    return np.asarray(answer.U).reshape(len(given), -1, system.nu)
 
 
 def blind_to_before(W: np.ndarray, system: LinearSystem) -> np.ndarray:
@@ -169,20 +158,18 @@ def weight_loops(
 
 @jax.jit(static_argnums=3)
 def _loops(system: LinearSystem, problems: Any, x0: Any, steps: int) -> Any:
-    def one(problem: CondensedProblem) -> tuple[Any, Any]:
-        def step(now: Any, _: None) -> tuple[Any, tuple[Any, Any]]:
-            x, before = now
-            given = jnp.concatenate([x, before], axis=1)
-            U, done, _, _ = solve_box(problem, given, PRECISION)
-            u = jnp.where(done[:, None], U[:, : system.nu], jnp.nan)
-            x_next = system.step(x, u)
-            return (x_next, u), (x_next, u)
+    def step(now: Any, _: None) -> tuple[Any, tuple[Any, Any]]:
+        x, before = now
+        answer = solve(problems, jnp.concatenate([x, before], axis=-1), PRECISION)
+        u = jnp.where((answer.status == SOLVED)[..., None], answer.U[..., : system.nu], jnp.nan)
+        x_next = system.step(x, u)
+        return (x_next, u), (x_next, u)
 
-        start = x0, jnp.zeros((len(x0), system.nu))
-        _, (x, u) = jax.lax.scan(step, start, None, length=steps)
-        return jnp.swapaxes(jnp.concatenate([x0[None], x]), 0, 1), jnp.swapaxes(u, 0, 1)
-
-    return jax.vmap(one)(problems)
+    count = len(problems.scale)
+    start = jnp.broadcast_to(x0, (count, *x0.shape)), jnp.zeros((count, len(x0), system.nu))
+    _, (x, u) = jax.lax.scan(step, start, None, length=steps)
+    x = jnp.concatenate([start[0][None], x])
+    return jnp.moveaxis(x, 0, 2), jnp.moveaxis(u, 0, 2)
 
 
 def fresh_pairs(

@@ -10,7 +10,8 @@ from scipy.optimize import linprog
 from prefmpc._random import generator
 from prefmpc.comparisons import Comparisons
 from prefmpc.convex import fit_map
-from prefmpc.evaluation import accuracy, closed_loops, simulate
+from prefmpc.evaluation import accuracy, simulate
+from prefmpc.loops import closed_loops
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc import LinearMPC, TerminalIngredients, terminal_ingredients
 from prefmpc.pools import lqr_pool, random_states
