@@ -19,7 +19,14 @@ from prefmpc._pytree import bypass_init
 from prefmpc._sharding import WHOLE, check_mesh, on_mesh, padded, shares
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc._batched_qp import SOLVED, STATUSES, solve, with_derivative
-from prefmpc.mpc.batched import Controllers, Terminal, controllers, leading_axis, starts
+from prefmpc.mpc.batched import (
+    Controllers,
+    Terminal,
+    controllers,
+    leading_axis,
+    starts,
+    without_haste,
+)
 from prefmpc.sets import Polyhedron
 from prefmpc.systems import LinearSystem
 from prefmpc.trajectories import Trajectory
@@ -117,11 +124,15 @@ def closed_loops(
     tol = nonnegative("tol", tol)
     many, truth = _with_plants(many, plants)
     begin, lead = starts(x0, system.nx, many)
-    run = _program(horizon, steps)
-    if mesh is None:
-        out = run(*many, truth, begin, tol)
-    else:
-        out = _shared(run, check_mesh(mesh), many, truth, begin, tol)
+    mesh = None if mesh is None else check_mesh(mesh)
+
+    def run(thorough: bool) -> _Loop:
+        program = _program(horizon, steps, thorough=thorough)
+        if mesh is None:
+            return program(*many, truth, begin, tol)
+        return _shared(program, mesh, many, truth, begin, tol)
+
+    out = without_haste(many, run, lambda out: out.codes)
     out = jax.tree.map(lambda a: np.asarray(a).reshape(*lead, *a.shape[2:]), out)
     return ClosedLoops(
         trajectories=bypass_init(Trajectory, x=out.x, u=out.u, y=out.y),
@@ -196,13 +207,15 @@ def _with_plants(
 
 
 @lru_cache(maxsize=256)
-def _program(horizon: int, steps: int, derivative: bool = False) -> Callable[..., _Loop]:
+def _program(
+    horizon: int, steps: int, *, derivative: bool = False, thorough: bool = True
+) -> Callable[..., _Loop]:
     """Return the compiled simulation; one object for each size, so that it compiles once."""
 
     def step_of(problem: Any, plants: LinearSystem, tol: Any) -> Callable[..., Any]:
         def step(now: Any, _: None) -> Any:
             x, before = now
-            answer = solve(problem, x, tol)
+            answer = solve(problem, x, tol, thorough=thorough)
             U = with_derivative(problem, x, answer) if derivative else answer.U
             u = jnp.where((answer.status == SOLVED)[..., None], U[..., : plants.nu], jnp.nan)
             code = jnp.where(before == SOLVED, answer.status, before)

@@ -276,7 +276,7 @@ def test_too_few_iterations_are_never_silent(monkeypatch):
 
 
 def test_unsolved_states_of_a_batch_are_nan_and_the_others_are_not(monkeypatch):
-    monkeypatch.setattr(_batched_qp, "ACTIVE_SET_STEPS", 0)
+    monkeypatch.setattr(_batched_qp, "BOX_STEPS", 0)
     monkeypatch.setattr(_batched_qp, "POLISHING_STEPS", 0)
     monkeypatch.setattr(_interior, "LIMIT", 1)
     # A horizon that no other test uses, so that nothing compiled before is used again.

@@ -19,11 +19,15 @@ import numpy as np
 from prefmpc.mpc._condensed import CondensedProblem
 from prefmpc.mpc._interior import interior_point
 
-ACTIVE_SET_STEPS = 15
+BOX_STEPS = 60
+STEPS = 15
 PATIENCE = 5
-"""After so many steps, one that finishes no problem is the last."""
+"""With polyhedra, a step after so many that finishes no problem is the last."""
 
-POLISHING_STEPS = 3
+TRIES = 3
+"""Changes of the whole active set that may be in vain before single ones are made."""
+
+POLISHING_STEPS = 6
 CHUNK = 32
 """Problems that the interior-point method takes at a time."""
 
@@ -70,19 +74,24 @@ class _Search(NamedTuple):
     iterations: Any
 
 
-def solve(problem: CondensedProblem, x0: Any, tol: Any) -> Answer:
-    """Solve for the states x0 (c, k, nx). Derivatives: see `with_derivative`."""
+def solve(problem: CondensedProblem, x0: Any, tol: Any, *, thorough: bool = True) -> Answer:
+    """Solve for the states x0 (c, k, nx). Derivatives: see `with_derivative`.
+
+    Without ``thorough`` what the active-set method leaves over stays unfinished; the program then
+    compiles in a third of the time.
+    """
     problem, x0 = jax.lax.stop_gradient((problem, x0))
     data = _data(problem, x0)
     dead = ~jnp.isfinite(data.g).all(-1)
     found = _active_set(problem, data, dead, tol)
-    none = jnp.zeros_like(dead)
-    found, infeasible = jax.lax.cond(
-        jnp.all(found.done | dead),
-        lambda found: (found, none),
-        lambda found: _left_over(problem, data, found, dead, tol),
-        found,
-    )
+    infeasible = jnp.zeros_like(dead)
+    if thorough:
+        found, infeasible = jax.lax.cond(
+            jnp.all(found.done | dead),
+            lambda found: (found, infeasible),
+            lambda found: _left_over(problem, data, found, dead, tol),
+            found,
+        )
     n = problem.H.shape[-1]
     U = jnp.clip(found.V, data.lower[..., :n], data.upper[..., :n]) * problem.scale[:, None]
     status = jnp.where(found.done, SOLVED, jnp.where(infeasible, INFEASIBLE, UNFINISHED))
@@ -169,37 +178,70 @@ def _excess(data: _Data, high: Any, low: Any) -> Any:
     return jnp.where(high | low, data.free - limits, 0.0)
 
 
+class _Guess(NamedTuple):
+    """Rows at their upper and lower limits (c, k, m); see `_next_guess`."""
+
+    high: Any
+    low: Any
+    fewest: Any
+    tries: Any
+
+
+def _next_guess(guess: _Guess, high: Any, low: Any) -> _Guess:
+    """Take over which rows look active, or only the last change if that has not helped lately.
+
+    Changing all at once needs few steps but may go round in circles; changing the one with the
+    largest index ends for sure if the rows are independent. Júdice and Pires' block pivoting.
+    """
+    changed = (high != guess.high) | (low != guess.low)
+    number = jnp.sum(changed, axis=-1)
+    better = number < guess.fewest
+    tries = jnp.where(better, TRIES, guess.tries - 1)
+    last = jnp.cumsum(changed[..., ::-1], axis=-1)[..., ::-1] == 1
+    taken = changed & ((tries >= 0)[..., None] | last)
+    return _Guess(
+        jnp.where(taken, high, guess.high),
+        jnp.where(taken, low, guess.low),
+        jnp.minimum(number, guess.fewest),
+        tries,
+    )
+
+
 def _active_set(problem: CondensedProblem, data: _Data, dead: Any, tol: Any) -> _Search:
     """Guess the active rows, solve for their multipliers, look which rows are active then.
 
     Hintermüller, Ito and Kunisch's primal-dual active-set method. Where the guess repeats itself
-    it is exact; it may also go round in circles, and then is given up.
+    it is exact.
     """
-
     n = problem.H.shape[-1]
+    steps, patience = (BOX_STEPS, BOX_STEPS) if problem.G is None else (STEPS, PATIENCE)
 
     def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        k, now, idle, _ = carry
+        k, now, guess, idle, _ = carry
         high, low = _active(data, _diagonal(problem) * now.multipliers, now.rows)
+        guess = _next_guess(guess, high, low)
         # More active rows than inputs depend on each other: too hard a case for this method.
-        idle |= now.done | (jnp.sum(high | low, axis=-1) > n)
-        active = (high | low) & ~idle[..., None]
+        both = guess.high | guess.low
+        idle |= now.done | (jnp.sum(both, axis=-1) > n)
+        active = both & ~idle[..., None]
         kept = jnp.where(active, now.multipliers, 0.0)
-        excess = _excess(data, high, low)
+        excess = _excess(data, guess.high, guess.low)
         rest = jnp.where(active, excess - kept @ problem.dual, 0.0)
-        exact = 1e-12 * jnp.linalg.norm(jnp.where(active, jnp.abs(excess) + 1, 0.0), axis=-1)
-        kept += _conjugate_gradients(problem.dual, active, rest, exact, limit=n + 5)
+        exact = 1e-13 * jnp.linalg.norm(jnp.where(active, jnp.abs(excess) + 1, 0.0), axis=-1)
+        kept += _conjugate_gradients(problem.dual, active, rest, exact, limit=2 * n)
         V = _plan(problem, data, kept)
         new = _kept(idle, now, _judged(problem, data, V, kept, now.iterations + 1, tol))
-        return k + 1, new, idle | new.done, jnp.all(new.done == now.done)
+        return k + 1, new, guess, idle | new.done, jnp.all(new.done == now.done)
 
     def unfinished(carry: tuple[Any, ...]) -> Any:
-        k, _, idle, stuck = carry
-        return (k < ACTIVE_SET_STEPS) & ~jnp.all(idle) & ~((k >= PATIENCE) & stuck)
+        k, _, _, idle, stuck = carry
+        return (k < steps) & ~jnp.all(idle) & ~((k >= patience) & stuck)
 
     none, count = jnp.zeros_like(data.free), jnp.zeros(dead.shape, dtype=int)
     start = _judged(problem, data, data.V, none, count, tol)
-    return jax.lax.while_loop(unfinished, step, (0, start, dead | start.done, False))[1]
+    nowhere = jnp.zeros_like(data.free, dtype=bool)
+    guess = _Guess(nowhere, nowhere, jnp.full(dead.shape, none.shape[-1] + 1), count + TRIES)
+    return jax.lax.while_loop(unfinished, step, (0, start, guess, dead | start.done, False))[1]
 
 
 def _kept(keep: Any, old: Any, new: Any) -> Any:
@@ -289,7 +331,9 @@ def _by_interior_point(
         return k + 1, now, _kept(~(now.residual < best.residual), best, now)
 
     _, _, best = jax.lax.while_loop(
-        lambda carry: (carry[0] < POLISHING_STEPS) & ~jnp.all(settled | carry[2].done),
+        lambda carry: (
+            (carry[0] < POLISHING_STEPS) & ((carry[0] == 0) | ~jnp.all(settled | carry[2].done))
+        ),
         polish,
         (0, start, start),
     )

@@ -15,11 +15,12 @@ import jax.numpy as jnp
 from jax.lax.linalg import cholesky, triangular_solve
 
 LIMIT = 50
-TOLERANCE = 1e-10
+TOLERANCE = 1e-12
 PROOF = 1e-9
 """‖Gᵀz‖∞ relative to −hᵀz > 0: how exactly multipliers have to prove that there is no solution."""
 
 TO_BOUNDARY = 0.99
+REFINEMENTS = 2
 
 
 class _Point(NamedTuple):
@@ -109,36 +110,41 @@ def interior_point(P: Any, q: Any, G: Any, lower: Any, upper: Any, skip: Any) ->
         k, state = carry
         x, s, z, tau, kappa = state.point
         t, scaled = tau[:, None], x / tau[:, None]
-        Px = _times(P, scaled)
-        on_x = -(Px * t + columns(z) + q * t)
+        Px, pull = _times(P, scaled), columns(z)
+        on_x = -(Px * t + pull + q * t)
         on_z = -jnp.where(real, rows(x) + s - h * t[..., None], 0.0)
-        on_tau = -(kappa + total(q, x) + total(h, z) + total(x, Px))
+        curve, by_x, by_h = total(scaled, Px), total(q, scaled), total(h, z)
+        on_tau = -(kappa + tau * by_x + by_h + tau * curve)
+
+        gap = jnp.abs(curve + by_x + by_h / tau) / (1 + jnp.abs(curve / 2 + by_x))
+        primal, dual = jnp.abs(on_z).max((1, 2)) / largest_h, jnp.abs(on_x).max(-1) / largest_q
+        worst = jnp.maximum(jnp.maximum(primal, dual) / tau, gap)
+        # At a degenerate corner a slack and its multiplier both go to zero, and more slowly.
+        both = jnp.where(real, jnp.minimum(s, z), 0.0).max((1, 2)) / tau
+        arrived = (worst <= TOLERANCE) & (both <= 100 * TOLERANCE)
+        proof = (by_h < 0) & (jnp.abs(pull).max(-1) <= -PROOF * by_h) & ~arrived
+        infeasible = state.infeasible | (proof & ~state.done)
+        done = state.done | arrived | proof
+
         weight = z / s
         root = inverse_root(weight)
         slope = q + 2 * Px
 
-        def solved(right: Any) -> Any:
-            return _back(root, _times(root, right))
+        def solved(on_x: Any, on_z: Any) -> tuple[Any, Any]:
+            """Solve P dx + Gᵀdz = on_x and G dx − dz/weight = on_z."""
 
-        x_tau = solved(columns(weight * h) - q)
-        z_tau = weight * (rows(x_tau) - h)
-        bend = -kappa / tau + total(slope, x_tau) + total(h, z_tau) - total(scaled, Px)
+            def refined(_: Any, both: tuple[Any, Any]) -> tuple[Any, Any]:
+                # Near the solution weights reach 1e10 and more: what rounding has left over.
+                dx, dz = both
+                more = on_x - _times(P, dx) - columns(dz)
+                more = _back(root, _times(root, more))
+                return dx + more, dz + weight * rows(more)
 
-        def direction(keep: Any, on_sz: Any, on_tk: Any) -> _Point:
-            """Newton's step to residuals ``keep`` times as large, with given products s∘z, τκ."""
-            rest = 1 - keep
-            shift = jnp.where(real, _column(rest) * on_z - on_sz / jnp.where(real, z, 1.0), 0.0)
-            dx = solved(rest[:, None] * on_x + columns(weight * shift))
-            dz = weight * (rows(dx) - shift)
-            dtau = (rest * on_tau - on_tk / tau - total(slope, dx) - total(h, dz)) / bend
-            dx, dz = dx + dtau[:, None] * x_tau, dz + _column(dtau) * z_tau
-            for _ in range(2):
-                # Near the solution the weights reach 1e10 and more: what rounding has left over.
-                error = rest[:, None] * on_x - _times(P, dx) - columns(dz) - q * dtau[:, None]
-                more = solved(error)
-                dx, dz = dx + more, dz + weight * rows(more)
-            ds = jnp.where(real, (on_sz - s * dz) / jnp.where(real, z, 1.0), 0.0)
-            return _Point(dx, ds, dz, dtau, (on_tk - kappa * dtau) / tau)
+            first = jnp.zeros_like(x), -weight * on_z
+            return jax.lax.fori_loop(0, 1 + REFINEMENTS, refined, first)
+
+        x_tau, z_tau = solved(-q, h)
+        bend = -kappa / tau + total(slope, x_tau) + total(h, z_tau) - curve
 
         def length(d: _Point) -> Any:
             def room(v: Any, dv: Any) -> Any:
@@ -149,44 +155,36 @@ def interior_point(P: Any, q: Any, G: Any, lower: Any, upper: Any, skip: Any) ->
             return jnp.minimum(jnp.stack(parts).min(0), 1.0)
 
         mu = (total(s, z) + tau * kappa) / count
-        straight = direction(jnp.zeros_like(tau), -s * z, -kappa * tau)
-        keep = (1 - length(straight)) ** 3
-        bent = direction(
-            keep,
-            jnp.where(real, _column(keep * mu) - s * z - straight.s * straight.z, 0.0),
-            keep * mu - kappa * tau - straight.tau * straight.kappa,
-        )
+
+        def newton(_: Any, last: _Point) -> _Point:
+            """Mehrotra's predictor if ``last`` is 0, and the corrector that follows it."""
+            keep = (1 - length(last)) ** 3
+            rest = 1 - keep
+            on_sz = jnp.where(real, _column(keep * mu) - s * z - last.s * last.z, 0.0)
+            on_tk = keep * mu - kappa * tau - last.tau * last.kappa
+            shift = jnp.where(real, _column(rest) * on_z - on_sz / jnp.where(real, z, 1.0), 0.0)
+            dx, dz = solved(rest[:, None] * on_x, shift)
+            dtau = (rest * on_tau - on_tk / tau - total(slope, dx) - total(h, dz)) / bend
+            dx, dz = dx + dtau[:, None] * x_tau, dz + _column(dtau) * z_tau
+            ds = jnp.where(real, (on_sz - s * dz) / jnp.where(real, z, 1.0), 0.0)
+            return _Point(dx, ds, dz, dtau, (on_tk - kappa * dtau) / tau)
+
+        none = jax.tree.map(jnp.zeros_like, state.point)
+        bent = jax.lax.fori_loop(0, 2, newton, none)
         step = jnp.minimum(TO_BOUNDARY * length(bent), 1.0)
-        broken = ~(jnp.isfinite(step) & jnp.isfinite(bent.x).all(-1))
-        stay = state.done | broken
+        done |= ~(jnp.isfinite(step) & jnp.isfinite(bent.x).all(-1))
 
         def moved(v: Any, dv: Any) -> Any:
             axes = (-1,) + (1,) * (v.ndim - 1)
-            return jnp.where(stay.reshape(axes), v, v + step.reshape(axes) * dv)
+            return jnp.where(done.reshape(axes), v, v + step.reshape(axes) * dv)
 
         point = jax.tree.map(moved, state.point, bent)
-        arrived, proof = _verdict(point)
-        infeasible = state.infeasible | (proof & ~arrived & ~state.done)
-        done = state.done | broken | arrived | proof
-        return k + 1, _State(point, done, infeasible, state.count + ~state.done)
-
-    def _verdict(point: _Point) -> tuple[Any, Any]:
-        """Whether the point is optimal, and whether it proves that there is none."""
-        x, s, z, tau, _ = point
-        t, scaled = tau[:, None], x / tau[:, None]
-        Px, pull = _times(P, scaled), columns(z)
-        primal = jnp.abs(jnp.where(real, rows(scaled) + (s / t[..., None]) - h, 0.0)).max((1, 2))
-        dual = jnp.abs(Px + pull / t + q).max(-1)
-        curve, by_h = total(scaled, Px), total(h, z)
-        value = curve / 2 + total(q, scaled)
-        gap = jnp.abs(value + curve / 2 + by_h / tau) / (1 + jnp.abs(value))
-        worst = jnp.stack([primal / largest_h, dual / largest_q, gap]).max(0)
-        return worst <= TOLERANCE, (by_h < 0) & (jnp.abs(pull).max(-1) <= -PROOF * by_h)
+        return k + 1, _State(point, done, infeasible, state.count + ~done)
 
     nothing = jnp.zeros(len(q), dtype=bool)
     begin = _State(start(), skip, nothing, jnp.zeros(len(q), dtype=int))
     _, end = jax.lax.while_loop(
-        lambda carry: (carry[0] < LIMIT) & ~jnp.all(carry[1].done), move, (0, begin)
+        lambda carry: (carry[0] <= LIMIT) & ~jnp.all(carry[1].done), move, (0, begin)
     )
     back = size / end.point.tau
     z = end.point.z * _column(back)

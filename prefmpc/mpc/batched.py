@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -15,7 +15,7 @@ from jax.typing import ArrayLike
 from prefmpc._checks import array_module, nonnegative, positive_int
 from prefmpc._pytree import bypass_init
 from prefmpc.models import QuadraticCost
-from prefmpc.mpc._batched_qp import SOLVED, STATUSES, Answer, solve
+from prefmpc.mpc._batched_qp import SOLVED, STATUSES, UNFINISHED, Answer, solve
 from prefmpc.mpc._condensed import CondensedProblem, Sets, condense
 from prefmpc.mpc.solution import (
     Controller,
@@ -29,6 +29,7 @@ from prefmpc.systems import LinearSystem
 from prefmpc.trajectories import Trajectory
 
 Terminal = Polyhedron | TerminalIngredients
+T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,11 +123,22 @@ def starts(x0: ArrayLike, nx: int, many: Controllers) -> tuple[Any, tuple[int, .
     return array_module(x).broadcast_to(flat, (count, *flat.shape)), lead
 
 
-@jax.jit(static_argnums=3)
-def _solve_many(
-    systems: LinearSystem, costs: QuadraticCost, given: Sets | None, horizon: int, x0: Any, tol: Any
-) -> Answer:
-    return solve(Controllers(systems, costs, given, True).condensed(horizon), x0, tol)
+def without_haste(many: Controllers, run: Callable[[bool], T], status: Callable[[T], Any]) -> T:
+    """Return run(thorough): with input bounds alone a program without the last resort comes first.
+
+    It compiles sooner, and is hardly ever left with something to do.
+    """
+    if many.sets is None:
+        out = run(False)
+        if not (np.asarray(status(out)) == UNFINISHED).any():
+            return out
+    return run(True)
+
+
+@jax.jit(static_argnums=(1, 4))
+def _solve_many(parts: tuple[Any, Any, Any], horizon: int, x0: Any, tol: Any, thorough: bool) -> Answer:
+    problem = Controllers(*parts, True).condensed(horizon)
+    return solve(problem, x0, tol, thorough=thorough)
 
 
 class BatchedMPC(Controller):
@@ -183,7 +195,13 @@ class BatchedMPC(Controller):
         began = time.perf_counter()
         nx, nu = self.system.nx, self.system.nu
         begin, lead = starts(x0, nx, self._many)
-        answer = jax.tree.map(np.array, _solve_many(*self._many, self.horizon, begin, self.tol))
+        parts = tuple(self._many)
+        answer = without_haste(
+            self._many,
+            lambda thorough: _solve_many(parts, self.horizon, begin, self.tol, thorough),
+            lambda answer: answer.status,
+        )
+        answer = jax.tree.map(np.array, answer)
         U = answer.U
         U[answer.status != SOLVED] = np.nan
         U = U.reshape(*U.shape[:2], self.horizon, nu)
