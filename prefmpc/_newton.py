@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
+from jax.sharding import Mesh
 
 from prefmpc._checks import to_numpy
+from prefmpc._sharding import WHOLE, on_mesh, shares
 from prefmpc.comparisons import Comparisons
 from prefmpc.priors import WishartPrior
 from prefmpc.trajectories import Trajectory, second_moments
@@ -232,6 +235,10 @@ class _State(NamedTuple):
     stuck: Any
 
 
+def _here(value: Any) -> Any:
+    return value
+
+
 def newton(
     gap: Any,
     labels: Any,
@@ -241,6 +248,7 @@ def newton(
     wanted: Any,
     tol: Any,
     limit: Any,
+    total: Callable[[Any], Any] = _here,
 ) -> Minimum:
     """Minimise by primal-dual Newton steps along a path of ever weaker priors.
 
@@ -249,6 +257,9 @@ def newton(
     −log det W is taken as W⁻¹⊗Z with a dual Z instead of strength·W⁻¹⊗W⁻¹: a small eigenvalue of
     W then grows to its place at once, where it would else double in each step. At the end of the
     path the exact Hessian takes over, and its decrement is the certificate.
+
+    ``total`` adds up what is a sum over comparisons, where these are shared among devices: each
+    then takes the same steps.
 
     The calls to LAPACK depend on each other, one after the other: two that do not can wait for
     each other forever in a small thread pool.
@@ -265,7 +276,7 @@ def newton(
         # NaN outside of the cone, where Cholesky fails.
         L = factor(entries.matrix(w))
         log_det = 2 * jnp.sum(jnp.log(jnp.diag(L)))
-        return loss(z, labels, weights) + strength * (tightness * (precision @ w) - log_det)
+        return total(loss(z, labels, weights)) + strength * (tightness * (precision @ w) - log_det)
 
     def solve_newton(hessian: Any, gradient: Any) -> tuple[Any, Any]:
         unit = 1 / jnp.sqrt(jnp.diag(hessian))
@@ -286,7 +297,7 @@ def newton(
         W = entries.matrix(w)
         inverse = invert(W)
         _, slope, curvature = loss_and_slopes(z, labels, weights)
-        both = second_order(gap, slope, curvature)
+        both = total(second_order(gap, slope, curvature))
         gradient = both[-1] + strength * (tightness * precision - entries.gradient(inverse))
         # Near the end Z = strength·W⁻¹ up to rounding; then the exact Hessian is as good.
         last = arrived & (state.decrement <= ALMOST * (1 + jnp.abs(state.objective)))
@@ -344,12 +355,12 @@ def newton(
 
     w = mode[entries.rows, entries.columns]
     z = w @ gap
-    size = jnp.sqrt(weights @ z**2 / jnp.maximum(jnp.sum(weights), 1.0))
+    size = jnp.sqrt(total(weights @ z**2) / jnp.maximum(total(jnp.sum(weights)), 1.0))
     tightness = jnp.maximum(1.0, size / LOG_ODDS)
     w, z, inverse = w / tightness, z / tightness, invert(mode) * tightness
     _, slope, _ = loss_and_slopes(z, labels, weights)
     count = jnp.where(entries.rows == entries.columns, 1.0, 2.0)
-    pull = mode @ entries.matrix(gap @ slope / count) / tightness
+    pull = mode @ entries.matrix(total(gap @ slope) / count) / tightness
     strength = jnp.maximum(wanted, jnp.sqrt(jnp.abs(jnp.sum(pull * pull.T))))
     start = _State(
         w,
@@ -365,7 +376,7 @@ def newton(
     )
     end = jax.lax.while_loop(unfinished, move, start)
     value = objective(end.w, end.z, wanted, 1.0)
-    nll = loss(end.z, labels, weights)
+    nll = total(loss(end.z, labels, weights))
     return Minimum(end.w, value, -nll, end.decrement, end.hessian, end.steps)
 
 
@@ -373,6 +384,22 @@ _one = jax.jit(newton)
 _shared, _many = (
     jax.jit(jax.vmap(newton, in_axes=(gap, 0, 0, None, 0, 0, None, None))) for gap in (None, 0)
 )
+
+
+@lru_cache(maxsize=8)
+def _over(axes: Any) -> Callable[..., Minimum]:
+    """Return `newton` for comparisons shared along these axes of a mesh."""
+    return partial(newton, total=lambda value: jax.lax.psum(value, axes))
+
+
+def solve_shared(p: Problem, tol: float, limit: int, mesh: Mesh) -> Minimum:
+    """Minimise one problem, its comparisons shared among the devices of the mesh."""
+    each = shares(mesh)
+    columns = shares(mesh, axis=1)
+    arguments = (p.gap, p.labels, p.weights, p.entries, p.mode, p.strength, tol, limit)
+    specs = (columns, each, each, *[WHOLE] * 5)
+    minimum: Minimum = on_mesh(_over(mesh.axis_names), mesh, specs, WHOLE, arguments)
+    return minimum
 
 
 def solve(problems: Sequence[Problem], tol: float, limit: int) -> list[Minimum]:

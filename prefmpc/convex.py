@@ -15,11 +15,13 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from jax.typing import ArrayLike
 from scipy.special import ndtri
 
 from prefmpc._checks import finite_array, instance, nonnegative, positive_int, require_x64
-from prefmpc._newton import Entries, Minimum, Problem, build, pair_gaps, solve
+from prefmpc._newton import Entries, Minimum, Problem, build, pair_gaps, solve, solve_shared
+from prefmpc._sharding import check_mesh
 from prefmpc.comparisons import Comparisons
 from prefmpc.losses import FitError, padded_size
 from prefmpc.models import QuadraticCost
@@ -182,6 +184,7 @@ def fit_map(
     outputs: ArrayLike | None = None,
     max_iterations: int = 100,
     tol: float = 1e-8,
+    mesh: Mesh | None = None,
 ) -> MapResult:
     """Return the maximum a posteriori weights of a quadratic σ: one start, no randomness.
 
@@ -202,6 +205,9 @@ def fit_map(
         Q = CᵀQ_yC.
     tol : float
         Stop when half the squared Newton decrement is below ``tol`` times 1 + abs(objective).
+    mesh : jax.sharding.Mesh, optional
+        Devices to share the comparisons among; they may belong to several processes, which then
+        all make the same call.
 
     Returns
     -------
@@ -214,7 +220,8 @@ def fit_map(
     """
     instance("comparisons", comparisons, Comparisons)
     instance("prior", prior, WishartPrior)
-    results = _solved([comparisons], [prior], structure, outputs, max_iterations, tol)
+    mesh = None if mesh is None else check_mesh(mesh)
+    results = _solved([comparisons], [prior], structure, outputs, max_iterations, tol, mesh)
     _warn_of_failures(results)
     return results[0]
 
@@ -253,18 +260,23 @@ def _solved(
     outputs: ArrayLike | None,
     max_iterations: int,
     tol: float,
+    mesh: Mesh | None = None,
 ) -> list[MapResult]:
     require_x64()
     began = time.perf_counter()
     limit, tol = positive_int("max_iterations", max_iterations), nonnegative("tol", tol)
     C, entries = check(data_sets, beliefs, structure, outputs)
-    size = padded_size(max(len(data) for data in data_sets))
+    parts = 1 if mesh is None else mesh.size
+    size = parts * padded_size(max(-(-len(data) // parts) for data in data_sets))
     if all(data is data_sets[0] for data in data_sets):
         problems = build(data_sets[0], beliefs, entries, C, size)
     else:
         pairs = zip(data_sets, beliefs, strict=True)
         problems = [build(data, [prior], entries, C, size)[0] for data, prior in pairs]
-    minima = solve(problems, tol, limit)
+    if mesh is None:
+        minima = solve(problems, tol, limit)
+    else:
+        minima = [solve_shared(problem, tol, limit, mesh) for problem in problems]
     results = []
     for problem, minimum, data, prior in zip(problems, minima, data_sets, beliefs, strict=True):
         Q, R = split(problem.in_user_units(minimum.w), len(prior.Q), C)

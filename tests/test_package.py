@@ -121,7 +121,7 @@ LAYERS = {
     "losses": HELPERS | {"trajectories", "comparisons"},
     "training": HELPERS | {"_lbfgsb", "trajectories", "models", "comparisons", "losses"},
     "priors": HELPERS,
-    "_newton": HELPERS | {"trajectories", "comparisons", "models", "priors"},
+    "_newton": HELPERS | {"_sharding", "trajectories", "comparisons", "models", "priors"},
     "_chart": HELPERS | {"_newton"},
     "uncertainty": {
         *HELPERS,
@@ -131,7 +131,7 @@ LAYERS = {
     "global_fit": HELPERS | {"_newton", "comparisons", "models", "losses"},
     "convex": {
         *HELPERS,
-        *("_newton", "trajectories", "comparisons", "models", "losses", "priors"),
+        *("_newton", "_sharding", "trajectories", "comparisons", "models", "losses", "priors"),
     },
     "_network": HELPERS | {"trajectories"},
     "networks": HELPERS | {"_network", "sets"},

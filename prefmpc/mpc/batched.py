@@ -136,7 +136,9 @@ def without_haste(many: Controllers, run: Callable[[bool], T], status: Callable[
 
 
 @jax.jit(static_argnums=(1, 4))
-def _solve_many(parts: tuple[Any, Any, Any], horizon: int, x0: Any, tol: Any, thorough: bool) -> Answer:
+def _solve_many(
+    parts: tuple[Any, Any, Any], horizon: int, x0: Any, tol: Any, thorough: bool
+) -> Answer:
     problem = Controllers(*parts, True).condensed(horizon)
     return solve(problem, x0, tol, thorough=thorough)
 
