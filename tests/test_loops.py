@@ -1,0 +1,264 @@
+"""Closed loops by the thousand, against one solve at a time; their derivatives; many devices."""
+
+from __future__ import annotations
+
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from prefmpc import (
+    BatchedMPC,
+    LinearMPC,
+    LinearSystem,
+    MPCError,
+    Polyhedron,
+    QuadraticCost,
+    closed_loops,
+    fit_map,
+    mpc_rollout,
+    oscillating_masses,
+    random_states,
+    simulate,
+    terminal_ingredients,
+)
+from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
+
+KEY = jax.random.key(2000)
+MASSES = oscillating_masses()
+PAPER = QuadraticCost(QUADRATIC_Q, QUADRATIC_R)
+OTHER = QuadraticCost(np.eye(6), 0.1 * np.eye(2))
+STATES = np.asarray(random_states(RADIUS, key=KEY, shape=(12,)))
+# Speed limits of two masses; half of the states are too energetic for them.
+LIMITS = Polyhedron(np.eye(8)[[3, 4, 4]] * [[1], [1], [-1]], [0.3] * 3)
+SLOW = [0, 4, 8, 9, 10]
+N, STEPS = 8, 6
+
+
+def one_by_one(controller, plant, x):
+    """Return x, u and the status that ended the loop."""
+    xs, us, status = [x], [], "solved"
+    for _ in range(STEPS):
+        answer = controller.solve(xs[-1])
+        status = answer.status
+        if status != "solved":
+            break
+        us.append(answer.u)
+        xs.append(plant.step(xs[-1], answer.u))
+    return np.array(xs), np.array(us).reshape(-1, plant.nu), status
+
+
+@pytest.mark.parametrize("end", [False, True])
+def test_loops_with_polyhedra_are_those_of_linear_mpc(end):
+    terminal = terminal_ingredients(MASSES, PAPER, constraints=LIMITS) if end else None
+    sets = {"constraints": LIMITS, "terminal": terminal}
+    found = closed_loops(MASSES, PAPER, STATES, horizon=N, steps=STEPS, **sets)
+    single = LinearMPC(MASSES, PAPER, N, **sets)
+    seen = set()
+    matters = 0
+    for i, x0 in enumerate(STATES):
+        x, u, status = one_by_one(single, MASSES, x0)
+        seen.add(status)
+        done = len(u)
+        assert found.solved[i] == (status == "solved")
+        assert (found.status[i, :done] == "solved").all()
+        assert (found.status[i, done:] == status).all()
+        np.testing.assert_allclose(found.trajectories.u[i, :done], u, rtol=0, atol=1e-5)
+        np.testing.assert_allclose(found.trajectories.x[i, : done + 1], x, rtol=0, atol=1e-5)
+        assert np.isnan(found.trajectories.u[i, done:]).all()
+        matters += (np.abs(np.abs(x[:, 3:5]) - 0.3) < 1e-5).any()
+    assert seen == {"solved", "infeasible"}
+    assert matters >= 2
+
+
+def test_answers_with_polyhedra_are_those_of_linear_mpc():
+    terminal = Polyhedron.box([-0.6] * 6, [0.6] * 6)
+    costs = QuadraticCost([PAPER.Q, OTHER.Q], [PAPER.R, OTHER.R])
+    sets = {"constraints": LIMITS, "terminal": terminal}
+    many = BatchedMPC(MASSES, costs, N, **sets).solve(STATES)
+    for i in range(2):
+        single = LinearMPC(MASSES, costs[i], N, **sets)
+        for k, x0 in enumerate(STATES):
+            answer = single.solve(x0)
+            assert many.status[i, k] == answer.status
+            if answer.success:
+                u = many.trajectory.u[i, k]
+                np.testing.assert_allclose(u, answer.trajectory.u, rtol=0, atol=2e-5)
+                assert many.cost[i, k] == pytest.approx(answer.cost, rel=1e-5)
+    assert set(many.status.ravel()) == {"solved", "infeasible"}
+    assert "infeasible" in many.message
+    with pytest.raises(MPCError, match=f"of {2 * len(STATES)} problems .* infeasible"):
+        BatchedMPC(MASSES, costs, N, **sets)(STATES)
+
+
+def test_many_models_and_many_plants():
+    heavy, light = oscillating_masses([1.3, 0.6, 1.2]), oscillating_masses([0.8, 0.5, 0.9])
+    plants = LinearSystem.stack([MASSES, heavy, light])
+    assert len(plants) == 3
+    np.testing.assert_array_equal(plants[1].A, heavy.A)
+    # One controller on three plants, and three models with the plant as they believe it is.
+    shared = closed_loops(MASSES, PAPER, STATES[:2], horizon=N, steps=STEPS, plants=plants)
+    knowing = closed_loops(plants, PAPER, STATES[:2], horizon=N, steps=STEPS)
+    crossed = closed_loops(plants, PAPER, STATES[:2], horizon=N, steps=STEPS, plants=MASSES)
+    assert shared.trajectories.x.shape == (3, 2, STEPS + 1, 6)
+    for i in range(3):
+        for found, model, plant in (
+            (shared, MASSES, plants[i]),
+            (knowing, plants[i], plants[i]),
+            (crossed, plants[i], MASSES),
+        ):
+            expected = simulate(plant, LinearMPC(model, PAPER, N), STATES[:2], STEPS)
+            np.testing.assert_allclose(found.trajectories.x[i], expected.x, rtol=0, atol=1e-5)
+            np.testing.assert_allclose(found.trajectories.y[i], expected.y, rtol=0, atol=1e-5)
+
+
+def person(T):
+    """What the controller does not know: force counts twice as much as it thinks."""
+    x, u = T.x[..., :-1, :], T.u
+    return jnp.einsum("...kx,...kx->...", x, x) + 2 * jnp.einsum("...ku,...ku->...", u, u)
+
+
+CALM = STATES[SLOW]
+
+
+@pytest.mark.parametrize("constraints", [None, LIMITS])
+def test_derivatives_are_those_of_finite_differences(constraints):
+    @jax.jit
+    def performance(cost, x0):
+        T = mpc_rollout(MASSES, cost, x0, horizon=N, steps=STEPS, constraints=constraints)
+        return person(T).mean()
+
+    plain = closed_loops(MASSES, PAPER, CALM, horizon=N, steps=STEPS, constraints=constraints)
+    assert float(performance(PAPER, CALM)) == pytest.approx(person(plain.trajectories).mean())
+    saturated = np.abs(plain.trajectories.u) > 1 - 1e-9
+    at_limit = np.abs(np.abs(plain.trajectories.x[..., 3:5]) - 0.3) < 1e-6
+    assert saturated.any()
+    assert at_limit.any() == (constraints is not None)
+
+    slopes = jax.jit(jax.grad(performance, argnums=(0, 1)))(PAPER, CALM)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        way = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape), (PAPER, CALM))
+
+        ahead = jax.tree.map(lambda a, b: a + 1e-6 * b, (PAPER, CALM), way)
+        behind = jax.tree.map(lambda a, b: a - 1e-6 * b, (PAPER, CALM), way)
+        expected = (performance(*ahead) - performance(*behind)) / 2e-6
+        pairs = zip(jax.tree.leaves(slopes), jax.tree.leaves(way), strict=True)
+        assert sum(np.vdot(a, b) for a, b in pairs) == pytest.approx(float(expected), rel=1e-5)
+        forward = jax.jvp(performance, (PAPER, CALM), way)[1]
+        assert float(forward) == pytest.approx(float(expected), rel=1e-5)
+
+
+DEVICES = """
+import sys
+import numpy as np, jax
+if len(sys.argv) > 1:
+    jax.distributed.initialize(f"127.0.0.1:{sys.argv[1]}", 2, int(sys.argv[2]))
+jax.config.update("jax_enable_x64", True)
+import prefmpc as p
+from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
+system, cost = p.oscillating_masses(), p.QuadraticCost(QUADRATIC_Q, QUADRATIC_R)
+mesh = jax.make_mesh((jax.device_count(),), ("devices",))
+assert mesh.size == COUNT, mesh
+worst = []
+
+def compare(ours, theirs):
+    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
+        assert a.shape == b.shape
+        np.testing.assert_array_equal(np.isnan(a), np.isnan(b))
+        worst.append(np.nanmax(np.abs(a - b)))
+
+def loops(costs, x0, **options):
+    return p.closed_loops(system, costs, x0, horizon=5, steps=4, **options)
+
+x0 = np.asarray(p.random_states(RADIUS, key=jax.random.key(5), shape=(21,)))
+stack = p.QuadraticCost.random(6, 2, key=jax.random.key(1), shape=(11,))
+cases = [(cost, x0, {}), (stack, x0[:1], {})]
+if COUNT == 8:
+    cases.append((cost, x0, {"constraints": p.Polyhedron(np.eye(8)[3:4], [0.3])}))
+for costs, states, options in cases:
+    alone, shared = loops(costs, states, **options), loops(costs, states, mesh=mesh, **options)
+    compare(alone.trajectories, shared.trajectories)
+    np.testing.assert_array_equal(alone.codes, shared.codes)
+assert COUNT == 2 or not alone.solved.all()
+
+pool = p.lqr_pool(system, 40, 10, key=jax.random.key(0), radius=RADIUS)
+person = p.QuadraticPreference(QUADRATIC_Q, QUADRATIC_R)
+data = p.Comparisons.random(pool, person, 6000, key=jax.random.key(1))
+prior = p.bryson(RADIUS, [1, 1])
+alone, shared = p.fit_map(data, prior), p.fit_map(data, prior, mesh=mesh)
+assert shared.success
+compare((alone.Q, alone.R), (shared.Q, shared.R))
+print("worst", max(worst))
+"""
+
+
+def devices(count, *arguments):
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
+    if not arguments:
+        environment["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={count}"
+    return subprocess.Popen(
+        [sys.executable, "-c", DEVICES.replace("COUNT", str(count)), *arguments],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+    )
+
+
+def worst_of(process):
+    out, err = process.communicate(timeout=240)
+    assert process.returncode == 0, err[-3000:]
+    return float(out.split("worst")[1])
+
+
+def test_eight_devices_say_what_one_says():
+    assert worst_of(devices(8)) <= 1e-10
+
+
+def test_two_processes_say_what_one_says():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = str(free.getsockname()[1])
+    both = [devices(2, port, str(i)) for i in range(2)]
+    assert max(map(worst_of, both)) <= 1e-10
+
+
+def loops(system=MASSES, costs=PAPER, x0=RADIUS[None], horizon=2, steps=2, **options):
+    return closed_loops(system, costs, x0, horizon=horizon, steps=steps, **options)
+
+
+PAIR = LinearSystem.stack([MASSES, MASSES])
+SCALAR = LinearSystem([[1]], [[1]], dt=1)
+THREE = QuadraticCost.random(6, 2, key=KEY, shape=(3,))
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: loops(system=PAIR, costs=THREE), "cost must be as many as the systems, 2"),
+        (lambda: loops(plants=SCALAR), "plants must have 6 states and 2 inputs.* got 1 and 1"),
+        (lambda: loops(plants=MASSES.A), "plants must be a LinearSystem, got ndarray"),
+        (lambda: loops(costs=THREE, plants=PAIR), r"plants must be a single one or a stack of 3"),
+        (lambda: loops(constraints=np.eye(8)), "constraints must be a Polyhedron"),
+        (lambda: loops(constraints=Polyhedron(np.eye(6), np.ones(6))), "constraints must have"),
+        (lambda: loops(terminal=LIMITS), "terminal must have dimension 6, got 8"),
+        (lambda: loops(mesh=8), "mesh must be a jax.sharding.Mesh, got int"),
+        (lambda: fit_map(None, None, mesh="all"), "comparisons must be"),
+        (lambda: mpc_rollout(MASSES, PAPER, RADIUS, horizon=0, steps=1), "horizon must be"),
+        (lambda: mpc_rollout(MASSES, PAPER, RADIUS[:3], horizon=1, steps=1), "x0 must have shape"),
+        (lambda: mpc_rollout(MASSES, 3, RADIUS, horizon=1, steps=1), "cost must be a Quadratic"),
+        (lambda: LinearSystem.stack([]), "systems must hold at least one"),
+        (lambda: LinearSystem.stack([MASSES, SCALAR]), "systems must agree in all shapes"),
+        (lambda: LinearSystem.stack([PAIR]), "systems must hold single LinearSystems"),
+    ],
+)
+def test_bad_input_is_named(call, words):
+    with pytest.raises(ValueError, match=words):
+        call()
