@@ -1,9 +1,10 @@
 """Part "loops": closed loops of the book's plant, 30 steps, N = 10, against other solvers.
 
 Three tables: one controller from 200 states; 200 different controllers from one state each, what
-they have to set up counted; a single small problem at a time. ``largest_error`` is the largest distance of an input, anywhere along the loops, from what
-DAQP finds at tolerances of 1e-12. ``seconds`` is the median for all 200 loops; where a peer ran
-fewer of them, ``loops_run`` says how many, and ``seconds`` is scaled up.
+they have to set up counted; a single small problem at a time. ``largest_error`` is the largest
+distance of an input, anywhere along the loops, from what DAQP finds at tolerances of 1e-12.
+``seconds`` is the median for all 200 loops; where a peer ran fewer of them, ``loops_run`` says how
+many, and ``seconds`` is scaled up.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ def peak_memory() -> float:
 
 def slope(sizes: Sequence[float], values: Sequence[float]) -> float:
     """Return the exponent p of values ~ sizesᵖ, by least squares over the upper half."""
-    half = len(sizes) // 2
+    half = (len(sizes) - 1) // 2
     return float(np.polyfit(np.log(sizes[half:]), np.log(values[half:]), 1)[0])
 
 
