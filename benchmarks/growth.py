@@ -2,7 +2,7 @@
 
 One size at a time: states m, horizon N, state dimension nx (more masses), controllers c.
 ``seconds`` is the median of a call of the compiled program of `closed_loops` on arrays that are
-ready, the answer copied out; ``memory_mb`` is what XLA plans for intermediate results and output together.
+ready, the answer copied out; ``memory_mb`` is what XLA plans for intermediate results and output.
 ``slope`` is the exponent of each, by least squares on logarithms over the upper half of the range.
 ``largest_error``: of the first loops, against DAQP at tolerances of 1e-12.
 """
