@@ -85,7 +85,7 @@ def scipy_map(comparisons: prefmpc.Comparisons, prior: prefmpc.WishartPrior) -> 
 
     start = np.linalg.cholesky(mode / unit / unit[:, None])[data.rows, data.columns]
     bounds = [(LOWER, None) if d else (None, None) for d in diagonal]
-    options = {"maxiter": 5000, "maxfun": 10_000, "maxcor": 20, "ftol": 1e-15, "gtol": 1e-6}
+    options = {"maxiter": 5000, "maxfun": 10_000, "maxcor": 20, "ftol": 1e-13, "gtol": 1e-6}
     found = minimize(objective, start, jac=True, bounds=bounds, method="L-BFGS-B", options=options)
     return float(found.fun - prior.strength * 2 * np.log(unit).sum())
 
