@@ -31,7 +31,7 @@ RANGES: dict[str, tuple[int, ...]] = {
     "nx": (4, 8, 16, 32),
     "c": (1, 30, 1000),
 }
-MINI: dict[str, tuple[int, ...]] = {"m": (2, 4)}
+MINI: dict[str, tuple[int, ...]] = {"m": (4,)}
 
 
 @dataclasses.dataclass(frozen=True)

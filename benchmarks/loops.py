@@ -196,8 +196,9 @@ def many_controllers(case: Case) -> dict[str, Any]:
     for name, make in peers.MAKERS.items():
         runs[name] = lambda make=make: loops(make, condense(), m)
     runs["LinearMPC"] = lambda: np.stack([linear(i) for i in range(sizes.linear_mpc)])
-    vmapped = peers.qpax_loops(case.system, problems, sizes.steps, QPAX)
-    runs["qpax"] = lambda: vmapped(case.x0)[0]
+    if sizes.repeats > 1:  # it takes long to compile
+        vmapped = peers.qpax_loops(case.system, problems, sizes.steps, QPAX)
+        runs["qpax"] = lambda: vmapped(case.x0)[0]
     rows = compare(runs, exact, sizes.repeats, {"LinearMPC": sizes.linear_mpc})
     prepare = {
         name: lambda make=make: [make(p) for p in condense()] for name, make in peers.MAKERS.items()

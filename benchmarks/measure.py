@@ -86,6 +86,8 @@ def peak_memory() -> float:
 
 def slope(sizes: Sequence[float], values: Sequence[float]) -> float:
     """Return the exponent p of values ~ sizesᵖ, by least squares over the upper half."""
+    if len(sizes) < 2:
+        return 0.0
     half = (len(sizes) - 1) // 2
     return float(np.polyfit(np.log(sizes[half:]), np.log(values[half:]), 1)[0])
 
@@ -111,6 +113,8 @@ def milliseconds(value: float | None) -> str:
     if value is None:
         return "–"
     value *= 1e3
+    if value < 1e-6:
+        return "0"
     return f"{value:.{max(0, 2 - int(np.floor(np.log10(max(value, 1e-9)))))}f}"
 
 
