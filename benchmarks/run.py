@@ -9,11 +9,18 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import os
+import sys
 import time
 from pathlib import Path
 
-import jax
-from measure import machine
+# The library of this checkout, whatever is installed; small matrices, for which threads only wait.
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import jax  # noqa: E402
+from measure import machine  # noqa: E402
 
 PARTS = ("loops", "constrained", "learning", "tables", "growth", "limit", "solvers", "nonlinear")
 
