@@ -19,8 +19,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
-import jax  # noqa: E402
-from measure import machine  # noqa: E402
+import jax
+from measure import machine
 
 PARTS = ("loops", "constrained", "learning", "tables", "growth", "limit", "solvers", "nonlinear")
 
