@@ -1,150 +1,189 @@
-"""Times of learning a quadratic σ: ``make bench``. Every ratio is against a peer in the same run.
+"""Part "learning": times of learning a quadratic σ from n comparisons, and where the minimum is.
 
-1. `fit_map` at n = 1000, warm, against (a) our fastest twenty restarts: second moments, one
-   compiled call; (b) the recipe as published: one restart after another on the trajectories,
-   compiled and warm, with jaxopt's L-BFGS-B as it comes; (c) the same with the line search
-   compiled as a loop, which jaxopt does when told to; (d) the recipe's own global minimum by
-   `fit_global`.
-2. The first call of a process, compilation included.
-3. A million comparisons: time and memory.
+``seconds`` is the median of a warm call; ``excess`` is how far the objective lies above the best
+of all that solve the same problem, relative to its size. Where a peer would take more than about
+10 s, its numbers are null and ``reason`` says so. A million comparisons are learned in a process
+of its own, for its peak memory. Last, the same number of comparisons of longer trajectories.
 """
 
 from __future__ import annotations
 
-import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import optax
-from jaxopt import LBFGSB
-from speed import median_seconds, python_seconds, stage_by_stage
+import learners
+import numpy as np
+from measure import child, median, seconds_of, show
 
-import prefmpc
-from prefmpc import studies, training
-
-PREPARE = """
-import time, jax, numpy as np
-jax.config.update("jax_enable_x64", True)
 import prefmpc
 from prefmpc import studies
-prior = prefmpc.bryson(studies.RADIUS, [1, 1])
-pool = prefmpc.lqr_pool(
-    prefmpc.oscillating_masses(), POOL, 10, key=jax.random.key(0), radius=studies.RADIUS
-)
-person = prefmpc.QuadraticPreference(studies.QUADRATIC_Q, studies.QUADRATIC_R)
+
+PRIOR = ([*studies.RADIUS], [1.0, 1.0])
+SIZES = (20, 1000, 10_000, 100_000, 1_000_000)
+HORIZONS = (10, 40, 160)
+RESTARTS = 20
+LONG = 3.0
+"""What takes longer (in s) is timed once, or three times for a million."""
+
+UP_TO = {
+    "fit_map": SIZES[-1],
+    "SciPy L-BFGS-B, NumPy": 100_000,
+    "Clarabel through CVXPY": 10_000,
+    "fit_global": 10_000,
+    "fit, 20 restarts at once": 10_000,
+    "SciPy L-BFGS-B, NumPy, 20 restarts": 10_000,
+    "jaxopt, 20 restarts one by one": 1000,
+}
+"""The largest n that each manages within about 10 s."""
+
+NOT_COMPILED = [name for name in UP_TO if name.startswith(("SciPy", "Clarabel"))]
+
+MILLION = """
+import json, sys
+import jax
+jax.config.update("jax_enable_x64", True)
+import learning, measure
+print(json.dumps(learning.with_memory(int(sys.argv[1]), 7)))
 """
 
-COLD = (
-    PREPARE.replace("POOL", "50")
-    + """
-data = prefmpc.Comparisons.random(pool, person, 1000, key=jax.random.key(1))
-began = time.perf_counter()
-assert prefmpc.fit_map(data, prior).success
-print(time.perf_counter() - began)
-"""
-)
 
-MILLION = (
-    PREPARE.replace("POOL", "2000")
-    + """
-import resource
-rng = np.random.default_rng(0)
-n = 1_000_000
-first = rng.integers(0, len(pool), n)
-second = (first + rng.integers(1, len(pool), n)) % len(pool)
-cost = prefmpc.phi(pool, studies.QUADRATIC_Q, studies.QUADRATIC_R)
-labels = (cost[first] <= cost[second]) ^ (rng.uniform(size=n) < 0.1)  # one in ten is wrong
-data = prefmpc.Comparisons(pool, first, second, labels)
-before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-assert prefmpc.fit_map(data, prior).success
-began = time.perf_counter()
-result = prefmpc.fit_map(data, prior)
-seconds = time.perf_counter() - began
-after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-print(result.iterations, after / 1024, before / 1024, seconds)
-"""
-)
+def pool_of(size: int, horizon: int = 10) -> prefmpc.Trajectory:
+    """Return trajectories to compare."""
+    system, key = prefmpc.oscillating_masses(), jax.random.key(0)
+    return prefmpc.lqr_pool(system, size, horizon, key=key, radius=studies.RADIUS)
 
 
-def recipe(comparisons: prefmpc.Comparisons, **options: Any) -> Callable[[Any], Any]:
-    """Return one restart of the recipe, compiled, on trajectories, with jaxopt's L-BFGS-B."""
-    first, second = comparisons.pairs
-    labels = jnp.asarray(comparisons.labels)
-
-    def loss(model: prefmpc.QuadraticCost) -> Any:
-        z = jax.vmap(lambda a, b: stage_by_stage(model, b) - stage_by_stage(model, a))(
-            first, second
-        )
-        ridge = sum(jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(model))
-        return optax.sigmoid_binary_cross_entropy(z, labels).mean() + 1e-6 * ridge
-
-    solver = LBFGSB(loss, maxiter=1000, history_size=10, tol=1e-3, **options)
-
-    @jax.jit
-    def train(start: prefmpc.QuadraticCost) -> Any:
-        bounds = start.bounds()
-        warm = training._projected_adam(loss, start, *bounds, 200, 0.01)
-        return solver.run(warm, bounds=bounds).params
-
-    return train
+def data_of(pool: prefmpc.Trajectory, n: int) -> prefmpc.Comparisons:
+    """Return n comparisons; of 10 000 and more, one in ten is answered wrongly."""
+    rng = np.random.default_rng(0)
+    first = rng.integers(0, len(pool), n)
+    second = (first + rng.integers(1, len(pool), n)) % len(pool)
+    cost = prefmpc.phi(pool, studies.QUADRATIC_Q, studies.QUADRATIC_R)
+    labels = cost[first] <= cost[second]
+    if n >= 10_000:
+        labels ^= rng.uniform(size=n) < 0.1
+    return prefmpc.Comparisons(pool, first, second, labels)
 
 
-def main() -> None:
-    """Print one line a measurement."""
-    jax.config.update("jax_enable_x64", True)
+def learners_of(data: prefmpc.Comparisons) -> dict[str, dict[str, Callable[[], float]]]:
+    """Return by problem and name what learns, and returns its objective."""
+    prior = prefmpc.bryson(*PRIOR)
     key = jax.random.key(0)
-    _, _, train, _ = studies.quadratic_data(key=key)
-    data = train[1000]
-    prior = prefmpc.bryson(studies.RADIUS, [1, 1])
-    starts = prefmpc.QuadraticCost.random(6, 2, key=key, shape=(20,))
+    starts = prefmpc.QuadraticCost.random(6, 2, key=key, shape=(RESTARTS,))
 
-    def one_after_another(one: Callable[[Any], Any]) -> Callable[[], None]:
-        def work() -> None:
-            for i in range(20):
-                jax.block_until_ready(one(starts[i]))
+    def ours() -> float:
+        result = prefmpc.fit(data, starts, key=key, selection="training_loss")
+        return float(result.training_loss.min())
 
-        return work
-
-    peers: dict[str, tuple[Callable[[], Any], int]] = {
-        "20 restarts at once, second moments": (
-            lambda: prefmpc.fit(data, key=key, selection="training_loss"),
-            7,
-        ),
-        "20 restarts one by one on trajectories, jaxopt as it comes": (
-            one_after_another(recipe(data)),
-            3,
-        ),
-        "the same, line search compiled as a loop": (
-            one_after_another(recipe(data, implicit_diff=False, unroll=False)),
-            3,
-        ),
-        "fit_global: the recipe's own minimum": (lambda: prefmpc.fit_global(data), 7),
+    return {
+        "MAP": {
+            "fit_map": lambda: prefmpc.fit_map(data, prior).objective,
+            "SciPy L-BFGS-B, NumPy": lambda: learners.scipy_map(data, prior),
+            "Clarabel through CVXPY": lambda: learners.clarabel_map(data, prior),
+        },
+        "recipe": {
+            "fit_global": lambda: prefmpc.fit_global(data).objective,
+            "fit, 20 restarts at once": ours,
+            "SciPy L-BFGS-B, NumPy, 20 restarts": lambda: learners.scipy_recipe(data, starts),
+            "jaxopt, 20 restarts one by one": learners.jaxopt_recipe(data, starts),
+        },
     }
-    ours = median_seconds(lambda: prefmpc.fit_map(data, prior), repeats=51)
-    print(f"fit_map, n = 1000, warm: {1e3 * ours:.1f} ms (wanted: at most 3)")
-    for name, (work, repeats) in peers.items():
-        theirs = median_seconds(work, repeats=repeats)
-        print(f"  {name}: {1e3 * theirs:.0f} ms, {theirs / ours:.0f} times as long")
-    for n in studies.SIZES:
-        seconds = median_seconds(lambda n=n: prefmpc.fit_map(train[n], prior), repeats=51)
-        result = prefmpc.fit_map(train[n], prior)
-        print(f"  n = {n:4d}: {1e3 * seconds:.1f} ms, {result.iterations} Newton steps")
-    print(f"fit_map, first call of a process: {python_seconds(COLD):.2f} s (wanted: under 2)")
-
-    run = subprocess.run(
-        [sys.executable, "-c", MILLION], check=True, capture_output=True, text=True
-    )
-    steps, after, before, seconds = (float(word) for word in run.stdout.split())
-    print(
-        f"a million comparisons, warm: {seconds:.2f} s for {steps:.0f} Newton steps (wanted: 5 s)"
-    )
-    print(
-        f"  peak memory {after:.0f} MB, {after - before:.0f} MB of it for learning (wanted: 2000)"
-    )
 
 
-if __name__ == "__main__":
-    main()
+def timed(work: Callable[[], float], repeats: int, compiled: bool) -> tuple[float, float, float]:
+    """Return the objective, and the seconds of the first call and of a later one."""
+    found: list[float] = []
+    first = seconds_of(lambda: found.append(work()))
+    if first > LONG and not compiled:  # the next call would take as long
+        return found[0], first, first
+    again = seconds_of(work)
+    return found[0], first, again if again > LONG or repeats == 1 else median(work, repeats)
+
+
+def with_memory(n: int, repeats: int) -> dict[str, Any]:
+    """Learn from n comparisons; return time, Newton steps, and the process's peak memory in MB."""
+    from measure import peak_memory
+
+    data, prior = data_of(pool_of(2000), n), prefmpc.bryson(*PRIOR)
+    before = peak_memory()
+    first = seconds_of(lambda: prefmpc.fit_map(data, prior))
+    result = prefmpc.fit_map(data, prior)
+    repeats = repeats if result.seconds < LONG else 3
+    seconds = float(np.median([prefmpc.fit_map(data, prior).seconds for _ in range(repeats)]))
+    return {
+        "seconds": seconds,
+        "first_call_seconds": first,
+        "newton_steps": result.iterations,
+        "objective": result.objective,
+        "peak_memory_mb": peak_memory(),
+        "before_learning_mb": before,
+    }
+
+
+def by_size(sizes: tuple[int, ...], pool: prefmpc.Trajectory, repeats: int) -> dict[str, Any]:
+    """Learn from more and more comparisons, by ours and by peers."""
+    rows: list[dict[str, Any]] = []
+    for n in sizes:
+        for problem, peers in learners_of(data_of(pool, n)).items():
+            here = []
+            for name, work in peers.items():
+                row: dict[str, Any] = {"n": n, "problem": problem, "name": name}
+                if n > UP_TO[name]:
+                    row |= {"seconds": None, "objective": None, "reason": "more than about 10 s"}
+                elif n == 1_000_000:
+                    row |= child(MILLION, n)
+                else:
+                    value, first, seconds = timed(work, repeats, name not in NOT_COMPILED)
+                    row |= {"seconds": seconds, "first_call_seconds": first, "objective": value}
+                here.append(row)
+                print(f"  n = {n}, {name}: {row['seconds']}", file=sys.stderr, flush=True)
+            best = min((row["objective"] for row in here if row["seconds"]), default=0.0)
+            for row in here:
+                if row["seconds"]:
+                    row["excess"] = (row["objective"] - best) / abs(best)
+                    row["times_ours"] = row["seconds"] / here[0]["seconds"]
+            rows += here
+    columns = {"n": "n", "problem": "problem", "name": "", "seconds": "ms", "times_ours": "× first"}
+    columns |= {"excess": "objective above the best", "first_call_seconds": "first call, ms"}
+    show("1. Learning from n comparisons of trajectories with N = 10", rows, columns)
+    last = rows[-len(UP_TO)] if len(rows) >= len(UP_TO) else rows[0]
+    if "peak_memory_mb" in last:
+        before, after = last["before_learning_mb"], last["peak_memory_mb"]
+        print(
+            f"  fit_map, n = {last['n']}: {last['newton_steps']} Newton steps, peak memory "
+            f"{after:.0f} MB, {after - before:.0f} MB of it for learning"
+        )
+    return {"rows": rows}
+
+
+def by_horizon(horizons: tuple[int, ...], size: int, n: int, repeats: int) -> dict[str, Any]:
+    """Learn from equally many comparisons of longer trajectories; their moments apart."""
+    rows = []
+    prior = prefmpc.bryson(*PRIOR)
+    for horizon in horizons:
+        pool = pool_of(size, horizon)
+        data = data_of(pool, n)
+        moments = median(lambda pool=pool: prefmpc.second_moments(pool), repeats)
+        seconds = median(lambda data=data: prefmpc.fit_map(data, prior), repeats)
+        steps = prefmpc.fit_map(data, prior).iterations
+        row = {"horizon": horizon, "seconds": seconds, "moments_seconds": moments}
+        each = (seconds - moments) / steps
+        rows.append(row | {"newton_steps": steps, "step_seconds": each})
+    columns = {"horizon": "N", "seconds": "fit_map, ms", "moments_seconds": "moments of it, ms"}
+    columns |= {"newton_steps": "Newton steps", "step_seconds": "ms a step without the moments"}
+    show(f"2. n = {n} comparisons of {size} trajectories of length N", rows, columns)
+    return {"n": n, "pool": size, "rows": rows}
+
+
+def run(mini: bool = False) -> dict[str, Any]:
+    """Run the part."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of CVXPY and jaxopt
+        if mini:
+            small = by_size((20,), pool_of(30), 1)
+            return {"by_size": small, "by_horizon": by_horizon((5, 10), 30, 20, 1)}
+        sizes = by_size(SIZES, pool_of(2000), 7)
+        return {"by_size": sizes, "by_horizon": by_horizon(HORIZONS, 2000, 10_000, 7)}

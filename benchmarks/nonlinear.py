@@ -1,6 +1,6 @@
-"""Nonlinear MPC: whose minima does it find, and how long does a solve take? ``make bench``.
+"""Part "nonlinear": whose minima does nonlinear MPC find, and how long does a solve take?
 
-1. 50 states of a lane change and of a pendulum on a cart: `NonlinearMPC` by both solvers against
+1. 10 states of a lane change and of a pendulum on a cart: `NonlinearMPC` by both solvers against
    CasADi with IPOPT (multiple shooting, a program of its own).
 2. Time of a warm solve in closed loop, median and 99th percentile, by horizon and solver.
 """
@@ -10,10 +10,12 @@ from __future__ import annotations
 import sys
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from measure import show
 
 from prefmpc import (
     MLPCost,
@@ -30,9 +32,9 @@ from prefmpc import (
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import multiple_shooting as peer
 
-STATES = 50
-HORIZONS = (10, 20, 40)
-LOOPS, STEPS = 2, 25
+STATES = 10
+HORIZONS = (10, 40)
+STEPS = 25
 SOLVERS = ("slsqp", "ipopt")
 
 
@@ -63,82 +65,93 @@ def swing_up(horizon: int, solver: str) -> tuple[NonlinearMPC, dict]:
     return NonlinearMPC(cart_pendulum(), cost, horizon, solver=solver), {}
 
 
-def agreement() -> None:
-    """Solve the same problems by all, and count who ends where."""
-    print(f"1. {STATES} states each, N = 10 and 40: NonlinearMPC and CasADi with IPOPT")
-    print(f"   {'':24s}{'same':>7s}{'ours is':>10s}{'theirs is':>11s}   statuses")
-    print(f"   {'':24s}{'cost':>7s}{'lower':>10s}{'lower':>11s}")
+def compared(controller: NonlinearMPC, options: dict, states: Any, answers: Any) -> dict[str, Any]:
+    """Count who ends where, and whether both ends are minima."""
+    statuses: Counter[str] = Counter()
+    row: dict[str, Any] = {"same": 0, "lower": 0, "higher": 0, "no_minimum": 0, "difference": 0.0}
+    for x0, (status, cost, plan) in zip(states, answers, strict=True):
+        controller.reset()
+        ours = controller.solve(x0, **options)
+        statuses[f"{ours.status} / {status}"] += 1
+        if not ours.success:
+            continue
+        apart = float((ours.cost - cost) / abs(cost))
+        if abs(apart) <= 1e-5:
+            row["same"] += 1
+            row["difference"] = max(row["difference"], abs(apart))
+            continue
+        row["lower" if apart < 0 else "higher"] += 1
+        # Started at their plan, ours must stay at their cost: then both are minima.
+        again = controller.solve(x0, start=plan, **options)
+        row["no_minimum"] += not abs(again.cost - cost) <= 1e-5 * abs(cost)
+    return row | {"statuses": ", ".join(f"{count} {s}" for s, count in statuses.items())}
+
+
+def agreement(count: int, solvers: tuple[str, ...], names: tuple[str, ...]) -> dict[str, Any]:
+    """Solve the same problems by ours and by CasADi with IPOPT."""
     problems = {
         "lane change": (10, lane_change, peer.lane_change, peer.lane_changes),
         "pendulum": (40, swing_up, peer.swing_up, peer.swing_ups),
     }
-    for name, (horizon, make, their, draw) in problems.items():
-        states = draw(STATES, np.random.default_rng(1))
+    rows = []
+    for name in names:
+        horizon, make, their, draw = problems[name]
+        states = draw(count, np.random.default_rng(1))
         solve = their(horizon)
         answers = [solve(x0) for x0 in states]
-        for solver in SOLVERS:
-            controller, options = make(horizon, solver)
-            statuses: Counter[str] = Counter()
-            same = lower = higher = inexact = 0
-            largest = 0.0
-            for x0, (status, cost, plan) in zip(states, answers, strict=True):
-                controller.reset()
-                ours = controller.solve(x0, **options)
-                statuses[f"{ours.status} / {status}"] += 1
-                if not ours.success:
-                    continue
-                apart = (ours.cost - cost) / abs(cost)
-                if abs(apart) <= 1e-5:
-                    same += 1
-                    largest = max(largest, abs(apart))
-                    continue
-                lower, higher = lower + (apart < 0), higher + (apart > 0)
-                # Started at their plan, ours must stay at their cost: then both are minima.
-                again = controller.solve(x0, start=plan, **options)
-                inexact += not abs(again.cost - cost) <= 1e-5 * abs(cost)
-            row = f"{same:7d}{lower:10d}{higher:11d}   "
-            row += ", ".join(f"{count} {s}" for s, count in statuses.items())
-            print(f"   {f'{name}, {solver}':24s}{row}", flush=True)
-            print(
-                f"   {'':24s}largest relative difference where the cost is the same {largest:.0e}; "
-                f"{inexact} of the others no minimum of both"
-            )
-    print()
+        for solver in solvers:
+            row = compared(*make(horizon, solver), states, answers)
+            rows.append({"name": f"{name}, {solver}", "states": count} | row)
+    columns = {
+        "name": "",
+        "states": "states",
+        "same": "same cost",
+        "difference": "largest difference",
+    }
+    columns |= {"lower": "ours lower", "higher": "theirs lower", "no_minimum": "not both minima"}
+    show("1. NonlinearMPC and CasADi with IPOPT", rows, columns | {"statuses": "ours / theirs"})
+    return {"rows": rows}
 
 
-def times() -> None:
-    """Print the table of solve times."""
+def warm_solves(controller: NonlinearMPC, options: dict, x: Any) -> tuple[list[float], int]:
+    """Return the seconds of each solve along a closed loop but the first, and the failures."""
+    seconds: list[float] = []
+    controller.solve(x, **options)  # compiles
+    controller.reset()
+    for k in range(STEPS + 1):
+        answer = controller.solve(x, **options)
+        if k:  # the first has no plan to start from
+            seconds.append(answer.seconds)
+        if not answer.success:
+            return seconds, 1
+        x = controller.system.step(x, answer.u)
+    return seconds, 0
+
+
+def times() -> dict[str, Any]:
+    """Time warm solves in closed loop."""
     controllers = {
         "lane change": lane_change,
         "pendulum": swing_up,
         "lane change, MLP": lambda N, solver: lane_change(N, solver, network=True),
     }
-    print(f"2. ms for a warm solve, median / 99th percentile of {LOOPS * STEPS}")
-    print("   " + " " * 24 + "".join(f"{f'N = {N}':>16s}" for N in HORIZONS) + "   not solved")
+    rows = []
     for name, make in controllers.items():
         states = peer.swing_ups if name == "pendulum" else peer.lane_changes
         for solver in SOLVERS:
-            row, failed = [], 0
             for N in HORIZONS:
-                controller, options = make(N, solver)
-                controller.solve(states(1, np.random.default_rng(0))[0], **options)  # compiles
-                seconds = []
-                for x in states(LOOPS, np.random.default_rng(2)):
-                    controller.reset()
-                    for k in range(STEPS + 1):
-                        answer = controller.solve(x, **options)
-                        if k:  # the first has no plan to start from
-                            seconds.append(answer.seconds)
-                        if not answer.success:
-                            failed += 1
-                            break
-                        x = controller.system.step(x, answer.u)
-                median, slow = np.quantile(1e3 * np.array(seconds), [0.5, 0.99])
-                row.append(f"{f'{median:.1f} / {slow:.1f}':>16s}")
-            print(f"   {f'{name}, {solver}':24s}" + "".join(row) + f"{failed:13d}", flush=True)
+                x = states(1, np.random.default_rng(2))[0]
+                seconds, failed = warm_solves(*make(N, solver), x)
+                middle, slow = (float(q) for q in np.quantile(seconds, [0.5, 0.99]))
+                row = {"name": f"{name}, {solver}", "N": N, "seconds": middle}
+                rows.append(row | {"slow_seconds": slow, "failed": failed})
+    columns = {"name": "", "N": "N", "seconds": "ms", "slow_seconds": "99 % below, ms"}
+    show(f"2. A warm solve, median of {STEPS}", rows, columns | {"failed": "not solved"})
+    return {"rows": rows}
 
 
-if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
-    agreement()
-    times()
+def run(mini: bool = False) -> dict[str, Any]:
+    """Run the part."""
+    if mini:
+        return {"agreement": agreement(2, SOLVERS[:1], ("lane change",))}
+    return {"agreement": agreement(STATES, SOLVERS, ("lane change", "pendulum")), "times": times()}

@@ -1,6 +1,6 @@
-"""The controllers with constraints: do they agree, and how long does a solve take? ``make bench``.
+"""Part "solvers": do the controllers with constraints agree, and how long does a solve take?
 
-1. 500 random problems with coupled constraints, input bounds and a terminal set: `LinearMPC`
+1. 100 random problems with coupled constraints, input bounds and a terminal set: `LinearMPC`
    (OSQP) against `ConvexMPC` (Clarabel).
 2. Time of a re-solve from another x(0), six states, median and 99th percentile: the quadratic
    through OSQP, the same and networks through Clarabel.
@@ -9,9 +9,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from typing import Any
 
 import jax
 import numpy as np
+from measure import show
 
 from prefmpc import (
     ConvexMPC,
@@ -24,17 +26,17 @@ from prefmpc import (
 )
 from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
-PROBLEMS, STATES = 500, 25
-HORIZONS = (10, 12, 20, 40)
-RESOLVES = 200
+PLANTS, STATES = 4, 25
+HORIZONS = (10, 40)
+RESOLVES = 100
 
 
-def agreement() -> None:
-    """Solve random problems with both, and print how far they are apart."""
+def agreement(plants: int, count: int) -> dict[str, Any]:
+    """Solve random problems with both, and say how far they are apart."""
     system, rng = oscillating_masses(), np.random.default_rng(5)
     statuses: Counter[tuple[str, str]] = Counter()
     apart, costs, residual = [0.0], [0.0], [0.0]
-    for _ in range(PROBLEMS // STATES):
+    for _ in range(plants):
         A, B = rng.normal(size=(6, 6)), rng.normal(size=(2, 2))
         cost = QuadraticCost(A @ A.T + 0.1 * np.eye(6), B @ B.T + 0.1 * np.eye(2))
         sets = {
@@ -42,28 +44,30 @@ def agreement() -> None:
             "terminal": Polyhedron(rng.normal(size=(2, 6)), rng.uniform(0.02, 1, 2)),
         }
         qp, cone = LinearMPC(system, cost, 5, **sets), ConvexMPC(system, cost, 5, **sets)
-        for x0 in rng.uniform(-0.5, 0.5, (STATES, 6)):
+        for x0 in rng.uniform(-0.5, 0.5, (count, 6)):
             a, b = qp.solve(x0), cone.solve(x0)
             statuses[a.status, b.status] += 1
             if a.success and b.success:
                 apart.append(np.abs(a.u - b.u).max())
                 costs.append(abs(a.cost - b.cost) / (1 + abs(a.cost)))
                 residual.append(b.residual)
-    print(f"1. {PROBLEMS} random problems, LinearMPC and ConvexMPC say:")
-    for (a, b), count in statuses.items():
-        print(f"   {count:4d}  {a}, {b}")
+    rows = [{"LinearMPC": a, "ConvexMPC": b, "count": n} for (a, b), n in statuses.items()]
+    columns = {"LinearMPC": "LinearMPC", "ConvexMPC": "ConvexMPC", "count": "problems"}
+    show(f"1. {plants * count} random problems with constraints: verdicts", rows, columns)
+    found = {"u": max(apart), "cost": max(costs), "residual": max(residual)}
     print(
-        f"   largest difference of u {max(apart):.1e}, of the cost {max(costs):.1e} (relative); "
-        f"largest residual of ConvexMPC {max(residual):.1e}\n"
+        f"  largest difference of u {found['u']:.1e}, of the cost {found['cost']:.1e} (relative); "
+        f"largest residual of ConvexMPC {found['residual']:.1e}"
     )
+    return {"rows": rows, "largest_difference": found}
 
 
-def times() -> None:
-    """Print the table of solve times."""
+def times(horizons: tuple[int, ...], resolves: int) -> dict[str, Any]:
+    """Time solves from many states."""
     system = oscillating_masses()
     quadratic = QuadraticCost(QUADRATIC_Q, QUADRATIC_R)
     scale = np.concatenate([[0.3] * 3, [1.0] * 5])
-    states = random_states(RADIUS, key=jax.random.key(1), shape=(RESOLVES,))
+    states = random_states(RADIUS, key=jax.random.key(1), shape=(resolves,))
 
     def network(activation: str, widths: tuple[int, ...]) -> ICNNCost:
         options = {"widths": widths, "activation": activation, "floor": 0.01}
@@ -76,20 +80,24 @@ def times() -> None:
         "squared ReLU 8": lambda N: ConvexMPC(system, network("squared_relu", (8,)), N),
         "softplus 8-8": lambda N: ConvexMPC(system, network("softplus", (8, 8)), N),
     }
-    print(f"2. ms for a re-solve, median / 99th percentile of {RESOLVES}")
-    print("   " + " " * 20 + "".join(f"{f'N = {N}':>14s}" for N in HORIZONS))
+    rows = []
     for name, make in controllers.items():
-        row = []
-        for N in HORIZONS:
+        for N in horizons:
             controller = make(N)
             solutions = [controller.solve(x0) for x0 in states]
             assert all(solution.success for solution in solutions)
-            median, slow = np.quantile([1e3 * s.seconds for s in solutions], [0.5, 0.99])
-            row.append(f"{f'{median:.1f} / {slow:.1f}':>14s}")
-        print(f"   {name:20s}" + "".join(row), flush=True)
+            middle, slow = np.quantile([s.seconds for s in solutions], [0.5, 0.99])
+            worst = max(float(s.residual) for s in solutions)
+            row = {"name": name, "N": N, "seconds": float(middle), "slow_seconds": float(slow)}
+            rows.append(row | {"largest_residual": worst})
+    columns = {"name": "", "N": "N", "seconds": "ms", "slow_seconds": "99 % below, ms"}
+    columns["largest_residual"] = "largest residual"
+    show(f"2. A solve from another state, median of {resolves}", rows, columns)
+    return {"rows": rows}
 
 
-if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
-    agreement()
-    times()
+def run(mini: bool = False) -> dict[str, Any]:
+    """Run the part."""
+    if mini:
+        return {"agreement": agreement(1, 5), "times": times((5,), 2)}
+    return {"agreement": agreement(PLANTS, STATES), "times": times(HORIZONS, RESOLVES)}
