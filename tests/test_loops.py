@@ -181,7 +181,7 @@ x0 = np.asarray(p.random_states(RADIUS, key=jax.random.key(5), shape=(21,)))
 stack = p.QuadraticCost.random(6, 2, key=jax.random.key(1), shape=(11,))
 cases = [(cost, x0, {}), (stack, x0[:1], {})]
 if COUNT == 8:
-    cases.append((cost, x0, {"constraints": p.Polyhedron(np.eye(8)[3:4], [0.3])}))
+    cases.append((cost, x0, {"constraints": p.Polyhedron(np.eye(8)[[3, 4]], [0.3, 0.3])}))
 for costs, states, options in cases:
     alone, shared = loops(costs, states, **options), loops(costs, states, mesh=mesh, **options)
     compare(alone.trajectories, shared.trajectories)

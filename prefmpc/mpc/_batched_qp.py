@@ -113,9 +113,10 @@ def _rows_of(problem: CondensedProblem, V: Any) -> Any:
 
 
 def _plan(problem: CondensedProblem, data: _Data, multipliers: Any) -> Any:
-    """Return V = −H⁻¹(g + Gᵀλ)."""
-    pull = multipliers if problem.G is None else multipliers @ problem.G
-    return -(data.g + pull) @ problem.inverse
+    """Return V = −H⁻¹(g + Gᵀλ), corrected once for what rounding has left over."""
+    slope = data.g + (multipliers if problem.G is None else multipliers @ problem.G)
+    V = -slope @ problem.inverse
+    return V - (V @ problem.H + slope) @ problem.inverse
 
 
 def _judged(

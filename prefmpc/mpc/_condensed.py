@@ -11,6 +11,9 @@ import numpy as np
 from prefmpc.models import QuadraticCost
 from prefmpc.systems import LinearSystem
 
+ON_LIMIT = 1e-6
+"""How far beyond a limit x_0 may be, in the unit of the limit, to count as on it."""
+
 
 class Sets(NamedTuple):
     """Polyhedra beside the input bounds: H_z (x_k, u_k) ≤ h_z on every stage, H_N x_N ≤ h_N."""
@@ -120,8 +123,13 @@ def scaled(
     dual = inverse
     if rows is not None:
         G, E, limits = rows
-        length = jnp.linalg.norm(G * scale, axis=1)
-        length = jnp.where(length > 1e-12, length, 1.0)[:, None]  # no input moves the others
+        # The unit of a row changes no solution: it needs no derivative.
+        length = jax.lax.stop_gradient(jnp.linalg.norm(G * scale, axis=1))
+        # What no input moves is a condition on x_0: one that lies on a limit keeps to it, even if
+        # rounding has pushed it over.
+        moves = length > 1e-12
+        limits = limits + jnp.where(moves, 0.0, ON_LIMIT)
+        length = jnp.where(moves, length, 1.0)[:, None]
         G = jnp.concatenate([jnp.eye(n), G * scale / length])
         E = jnp.concatenate([jnp.zeros((n, E.shape[1])), E / length])
         lower = jnp.concatenate([lower, jnp.full(len(limits), -jnp.inf)])

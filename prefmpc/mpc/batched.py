@@ -9,6 +9,7 @@ from functools import partial
 from typing import Any, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -52,14 +53,13 @@ class Controllers:
 
     def condensed(self, horizon: int) -> CondensedProblem:
         """Return the problems, each array with a leading axis of length c."""
-        parts: list[Any] = []
-        axes: list[int | None] = []
-        for part in (self.systems, self.costs):
-            own = part.batch_shape[0] == self.count
-            parts.append(part if own else part[0])
-            axes.append(0 if own else None)
+        parts, axes = zip(*map(self.own, (self.systems, self.costs)), strict=True)
         one = partial(condense, horizon=horizon, sets=self.sets)
         return jax.vmap(one, in_axes=axes)(*parts)
+
+    def own(self, part: Any) -> tuple[Any, int | None]:
+        """Return systems or costs and the axis to map over: None for one that all share."""
+        return (part, 0) if part.batch_shape[0] == self.count else (part[0], None)
 
 
 def leading_axis(part: Any) -> Any:
@@ -138,9 +138,26 @@ def without_haste(many: Controllers, run: Callable[[bool], T], status: Callable[
 @jax.jit(static_argnums=(1, 4))
 def _solve_many(
     parts: tuple[Any, Any, Any], horizon: int, x0: Any, tol: Any, thorough: bool
-) -> Answer:
-    problem = Controllers(*parts, True).condensed(horizon)
-    return solve(problem, x0, tol, thorough=thorough)
+) -> tuple[Answer, Trajectory, Any]:
+    """Return the answers, the plans (c, m) and their costs, NaN where not solved."""
+    many = Controllers(*parts, True)
+    plant, given = many.systems, many.sets
+    answer = solve(many.condensed(horizon), x0, tol, thorough=thorough)
+    solved = (answer.status == SOLVED)[..., None]
+    U = jnp.where(solved, answer.U, jnp.nan).reshape(*x0.shape[:2], horizon, plant.nu)
+
+    def step(x: Any, u: Any) -> tuple[Any, tuple[Any, Any]]:
+        return plant.step(x, u), (x, plant.output(x))
+
+    start = jnp.where(solved, x0, jnp.nan)
+    last, (x, y) = jax.lax.scan(step, start, jnp.moveaxis(U, 2, 0))
+    X, Y = jnp.moveaxis(jnp.concatenate([x, last[None]]), 0, 2), jnp.moveaxis(y, 0, 2)
+    plans = bypass_init(Trajectory, x=X, u=U, y=Y)
+    cost, axis = many.own(many.costs)
+    total = jax.vmap(lambda cost, T: cost(T), in_axes=(axis, 0))(cost, plans)
+    if given is not None and given.P is not None:
+        total = total + jnp.einsum("cmi,ij,cmj->cm", last, given.P, last)
+    return answer, plans, total
 
 
 class BatchedMPC(Controller):
@@ -195,53 +212,28 @@ class BatchedMPC(Controller):
         model, and without m for a single state. Raises a ValueError on a bad x0.
         """
         began = time.perf_counter()
-        nx, nu = self.system.nx, self.system.nu
-        begin, lead = starts(x0, nx, self._many)
+        begin, lead = starts(x0, self.system.nx, self._many)
         parts = tuple(self._many)
-        answer = without_haste(
-            self._many,
-            lambda thorough: _solve_many(parts, self.horizon, begin, self.tol, thorough),
-            lambda answer: answer.status,
+        answer, plans, cost = jax.tree.map(
+            np.asarray,
+            without_haste(
+                self._many,
+                lambda thorough: _solve_many(parts, self.horizon, begin, self.tol, thorough),
+                lambda out: out[0].status,
+            ),
         )
-        answer = jax.tree.map(np.array, answer)
-        U = answer.U
-        U[answer.status != SOLVED] = np.nan
-        U = U.reshape(*U.shape[:2], self.horizon, nu)
-        plant = self._many.systems
-        x = [begin]
-        for k in range(self.horizon):
-            x.append(plant.step(x[-1], U[..., k, :]))
-        X = np.stack(x, axis=-2)
-        X[answer.status != SOLVED] = np.nan
-        trajectory = bypass_init(
-            Trajectory,
-            x=X,
-            u=U,
-            y=np.moveaxis(plant.output(np.moveaxis(X[..., :-1, :], -2, 0)), 0, -2),
-        )
-        cost = self._cost_along(trajectory).reshape(lead)
+        trajectory = jax.tree.map(lambda a: a.reshape(*lead, *a.shape[2:]), plans)
         status = STATUSES[answer.status].reshape(lead)
         return MPCSolution(
-            u=U[..., 0, :].reshape(*lead, nu),
-            trajectory=jax.tree.map(lambda a: a.reshape(*lead, *a.shape[2:]), trajectory),
-            cost=cost,
+            u=trajectory.u[..., 0, :],
+            trajectory=trajectory,
+            cost=cost.reshape(lead),
             status=status if lead else str(status),
             message=self._message(answer),
             iterations=answer.iterations.reshape(lead),
             residual=answer.residual.reshape(lead),
             seconds=time.perf_counter() - began,
         )
-
-    def _cost_along(self, trajectory: Trajectory) -> np.ndarray:
-        costs, sets = self._many.costs, self._many.sets
-        axes = (0 if len(costs.theta_Q) == self._many.count else None, 0)
-        if axes[0] is None:
-            costs = costs[0]
-        total = jax.vmap(lambda cost, T: cost(T), in_axes=axes)(costs, trajectory)
-        if sets is not None and sets.P is not None:
-            last = trajectory.x[..., -1, :]
-            total = total + np.einsum("...i,ij,...j", last, sets.P, last)
-        return np.asarray(total)
 
     def _message(self, answer: Answer) -> str:
         failed = {
