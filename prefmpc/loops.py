@@ -212,23 +212,28 @@ def _program(
 ) -> Callable[..., _Loop]:
     """Return the compiled simulation; one object for each size, so that it compiles once."""
 
-    def step_of(problem: Any, plants: LinearSystem, tol: Any) -> Callable[..., Any]:
+    def step_of(
+        many: Controllers, problem: Any, plants: LinearSystem, tol: Any
+    ) -> Callable[..., Any]:
         def step(now: Any, _: None) -> Any:
-            x, before = now
-            answer = solve(problem, x, tol, thorough=thorough)
+            x, before, start = now
+            answer = solve(problem, x, tol, start=start, thorough=thorough)
             U = with_derivative(problem, x, answer) if derivative else answer.U
             u = jnp.where((answer.status == SOLVED)[..., None], U[..., : plants.nu], jnp.nan)
             code = jnp.where(before == SOLVED, answer.status, before)
             x_next = plants.step(x, u)
-            return (x_next, code), (x_next, u, plants.output(x), code, answer.iterations)
+            start = many.moved_on(answer.multipliers, horizon)
+            return (x_next, code, start), (x_next, u, plants.output(x), code, answer.iterations)
 
         return step
 
     @jax.jit
     def run(systems: Any, costs: Any, sets: Any, plants: Any, x0: Any, tol: Any) -> _Loop:
-        problem = Controllers(systems, costs, sets, stacked=True).condensed(horizon)
-        start = x0, jnp.full(x0.shape[:2], SOLVED)
-        step = step_of(problem, plants, tol)
+        many = Controllers(systems, costs, sets, stacked=True)
+        problem = many.condensed(horizon)
+        rows = problem.dual.shape[-1]
+        start = x0, jnp.full(x0.shape[:2], SOLVED), jnp.zeros((*x0.shape[:2], rows))
+        step = step_of(many, problem, plants, tol)
         _, (x, u, y, codes, iterations) = jax.lax.scan(step, start, None, length=steps)
         x = jnp.concatenate([x0[None], x])
         x, u, y, codes = (jnp.moveaxis(a, 0, 2) for a in (x, u, y, codes))

@@ -28,10 +28,13 @@ TRIES = 3
 """Changes of the whole active set that may be in vain before single ones are made."""
 
 POLISHING_STEPS = 6
-CHUNK = 32
+CHUNK = 8
 """Problems that the interior-point method takes at a time."""
 
 ROUNDING = 1e-14
+NOTHING = 1e-7
+"""Multipliers below, in the unit of the rows, do not say that a row was active."""
+
 STATUSES = np.array(["solved", "infeasible", "max_iterations"])
 SOLVED, INFEASIBLE, UNFINISHED = range(3)
 
@@ -74,16 +77,20 @@ class _Search(NamedTuple):
     iterations: Any
 
 
-def solve(problem: CondensedProblem, x0: Any, tol: Any, *, thorough: bool = True) -> Answer:
+def solve(
+    problem: CondensedProblem, x0: Any, tol: Any, *, start: Any = None, thorough: bool = True
+) -> Answer:
     """Solve for the states x0 (c, k, nx). Derivatives: see `with_derivative`.
 
+    ``start`` are multipliers (c, k, m) of a problem much like this one.
     Without ``thorough`` what the active-set method leaves over stays unfinished; the program then
     compiles in a third of the time.
     """
-    problem, x0 = jax.lax.stop_gradient((problem, x0))
+    problem, x0, start = jax.lax.stop_gradient((problem, x0, start))
     data = _data(problem, x0)
     dead = ~jnp.isfinite(data.g).all(-1)
-    found = _active_set(problem, data, dead, tol)
+    start = jnp.zeros_like(data.free) if start is None else start
+    found = _active_set(problem, data, start, dead, tol)
     infeasible = jnp.zeros_like(dead)
     if thorough:
         found, infeasible = jax.lax.cond(
@@ -208,18 +215,23 @@ def _next_guess(guess: _Guess, high: Any, low: Any) -> _Guess:
     )
 
 
-def _active_set(problem: CondensedProblem, data: _Data, dead: Any, tol: Any) -> _Search:
+def _active_set(problem: CondensedProblem, data: _Data, start: Any, dead: Any, tol: Any) -> _Search:
     """Guess the active rows, solve for their multipliers, look which rows are active then.
 
     Hintermüller, Ito and Kunisch's primal-dual active-set method. Where the guess repeats itself
-    it is exact.
+    it is exact. The first guess is what was active at ``start``, if anything was.
     """
+    pull = _diagonal(problem) * start
+    pushed, pulled = pull > NOTHING, pull < -NOTHING
+    warm = jnp.any(pushed | pulled, axis=-1, keepdims=True)
     n = problem.H.shape[-1]
     steps, patience = (BOX_STEPS, BOX_STEPS) if problem.G is None else (STEPS, PATIENCE)
 
     def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
         k, now, guess, idle, _ = carry
         high, low = _active(data, _diagonal(problem) * now.multipliers, now.rows)
+        first = warm & (k == 0)
+        high, low = jnp.where(first, pushed, high), jnp.where(first, pulled, low)
         guess = _next_guess(guess, high, low)
         # More active rows than inputs depend on each other: too hard a case for this method.
         both = guess.high | guess.low
@@ -239,10 +251,10 @@ def _active_set(problem: CondensedProblem, data: _Data, dead: Any, tol: Any) -> 
         return (k < steps) & ~jnp.all(idle) & ~((k >= patience) & stuck)
 
     none, count = jnp.zeros_like(data.free), jnp.zeros(dead.shape, dtype=int)
-    start = _judged(problem, data, data.V, none, count, tol)
+    free = _judged(problem, data, data.V, none, count, tol)
     nowhere = jnp.zeros_like(data.free, dtype=bool)
     guess = _Guess(nowhere, nowhere, jnp.full(dead.shape, none.shape[-1] + 1), count + TRIES)
-    return jax.lax.while_loop(unfinished, step, (0, start, guess, dead | start.done, False))[1]
+    return jax.lax.while_loop(unfinished, step, (0, free, guess, dead | free.done, False))[1]
 
 
 def _kept(keep: Any, old: Any, new: Any) -> Any:

@@ -57,6 +57,18 @@ class Controllers:
         one = partial(condense, horizon=horizon, sets=self.sets)
         return jax.vmap(one, in_axes=axes)(*parts)
 
+    def moved_on(self, multipliers: Any, horizon: int) -> Any:
+        """Return multipliers (c, m, rows) of a plan for the plan that begins one step later."""
+        sizes = [self.systems.nu, 0]
+        if self.sets is not None and self.sets.stage is not None:
+            sizes[1] = len(self.sets.stage)
+        parts, at = [], 0
+        for size in sizes:
+            now = multipliers[..., at : at + horizon * size]
+            parts.append(jnp.zeros_like(now).at[..., : now.shape[-1] - size].set(now[..., size:]))
+            at += horizon * size
+        return jnp.concatenate([*parts, multipliers[..., at:]], axis=-1)
+
     def own(self, part: Any) -> tuple[Any, int | None]:
         """Return systems or costs and the axis to map over: None for one that all share."""
         return (part, 0) if part.batch_shape[0] == self.count else (part[0], None)
