@@ -19,7 +19,7 @@ import numpy as np
 from prefmpc.mpc._condensed import CondensedProblem
 from prefmpc.mpc._interior import interior_point
 
-BOX_STEPS = 60
+BOX_STEPS = 120
 STEPS = 15
 PATIENCE = 5
 """With polyhedra, a step after so many that finishes no problem is the last."""
@@ -119,11 +119,19 @@ def _rows_of(problem: CondensedProblem, V: Any) -> Any:
     return V if problem.G is None else V @ problem.G.swapaxes(1, 2)
 
 
+def _columns_of(problem: CondensedProblem, multipliers: Any) -> Any:
+    return multipliers if problem.G is None else multipliers @ problem.G
+
+
 def _plan(problem: CondensedProblem, data: _Data, multipliers: Any) -> Any:
-    """Return V = −H⁻¹(g + Gᵀλ), corrected once for what rounding has left over."""
-    slope = data.g + (multipliers if problem.G is None else multipliers @ problem.G)
-    V = -slope @ problem.inverse
-    return V - (V @ problem.H + slope) @ problem.inverse
+    """Return V = −H⁻¹(g + Gᵀλ)."""
+    return -(data.g + _columns_of(problem, multipliers)) @ problem.inverse
+
+
+def _correction(problem: CondensedProblem, data: _Data, V: Any, multipliers: Any) -> Any:
+    """Return how far V is from H⁻¹(g + Gᵀλ), with the sign that moves it there if subtracted."""
+    slope = V @ problem.H + data.g + _columns_of(problem, multipliers)
+    return slope @ problem.inverse
 
 
 def _judged(
@@ -137,7 +145,7 @@ def _judged(
         # Zero where, and only where, the conditions for the optimum hold.
         reach = _diagonal(problem) * multipliers
         miss = jnp.clip(rows + reach, data.lower, data.upper) - rows
-        apart = V - _plan(problem, data, multipliers)
+        apart = _correction(problem, data, V, multipliers)
         unit = jnp.max(problem.scale, axis=-1)[:, None]
         residual = jnp.maximum(jnp.abs(miss).max(-1), jnp.abs(apart).max(-1)) * unit
         # Not the size of the multipliers: these grow without end where there is no solution.
@@ -180,10 +188,10 @@ def _active(data: _Data, reach: Any, rows: Any) -> tuple[Any, Any]:
     return high, (alone <= data.lower) & ~high
 
 
-def _excess(data: _Data, high: Any, low: Any) -> Any:
-    """Return how far active rows are beyond their limits without multipliers; 0 elsewhere."""
+def _excess(data: _Data, rows: Any, high: Any, low: Any) -> Any:
+    """Return how far active rows are beyond their limits; 0 elsewhere."""
     limits = jnp.where(high, data.upper, jnp.where(low, data.lower, 0.0))
-    return jnp.where(high | low, data.free - limits, 0.0)
+    return jnp.where(high | low, rows - limits, 0.0)
 
 
 class _Guess(NamedTuple):
@@ -238,12 +246,15 @@ def _active_set(problem: CondensedProblem, data: _Data, start: Any, dead: Any, t
         idle |= now.done | (jnp.sum(both, axis=-1) > n)
         active = both & ~idle[..., None]
         kept = jnp.where(active, now.multipliers, 0.0)
-        excess = _excess(data, guess.high, guess.low)
-        rest = jnp.where(active, excess - kept @ problem.dual, 0.0)
-        exact = 1e-13 * jnp.linalg.norm(jnp.where(active, jnp.abs(excess) + 1, 0.0), axis=-1)
-        kept += _conjugate_gradients(problem.dual, active, rest, exact, limit=2 * n)
-        V = _plan(problem, data, kept)
-        new = _kept(idle, now, _judged(problem, data, V, kept, now.iterations + 1, tol))
+        # Newton's step from where V is: repeated with the same rows it removes rounding errors.
+        V = now.V - _correction(problem, data, now.V, kept)
+        excess = _excess(data, _rows_of(problem, V), guess.high, guess.low)
+        rest = jnp.where(active, excess, 0.0)
+        limits = jnp.where(active, jnp.abs(now.rows) + 1, 0.0)
+        exact = 1e-13 * jnp.linalg.norm(limits, axis=-1)
+        more = _conjugate_gradients(problem.dual, active, rest, exact, limit=2 * n)
+        V -= _columns_of(problem, more) @ problem.inverse
+        new = _kept(idle, now, _judged(problem, data, V, kept + more, now.iterations + 1, tol))
         return k + 1, new, guess, idle | new.done, jnp.all(new.done == now.done)
 
     def unfinished(carry: tuple[Any, ...]) -> Any:
@@ -389,7 +400,7 @@ def with_derivative(problem: CondensedProblem, x0: Any, answer: Answer) -> Any:
         found = _conjugate_gradients(fixed.dual, active, inside, exact, 2 * inside.shape[-1])
         return jnp.where(active, found, right)
 
-    excess = _excess(data, high, low)
+    excess = _excess(data, data.free, high, low)
     multipliers = jax.lax.custom_linear_solve(on_active, excess, solved, symmetric=True)
     moving = _plan(problem, data, multipliers) * problem.scale[:, None]
     return answer.U + moving - jax.lax.stop_gradient(moving)
