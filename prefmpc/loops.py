@@ -133,7 +133,7 @@ def closed_loops(
         return _shared(program, mesh, many, truth, begin, tol)
 
     out = without_haste(many, run, lambda out: out.codes)
-    out = jax.tree.map(lambda a: np.asarray(a).reshape(*lead, *a.shape[2:]), out)
+    out = jax.tree.map(lambda a: np.asarray(a).reshape((*lead, *a.shape[2:])), out)
     return ClosedLoops(
         trajectories=bypass_init(Trajectory, x=out.x, u=out.u, y=out.y),
         solved=(out.codes == SOLVED).all(axis=-1),
