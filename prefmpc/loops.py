@@ -133,7 +133,7 @@ def closed_loops(
         return _shared(program, mesh, many, truth, begin, tol)
 
     out = without_haste(many, run, lambda out: out.codes)
-    out = jax.tree.map(lambda a: np.asarray(a).reshape(*lead, *a.shape[2:]), out)
+    out = jax.tree.map(lambda a: np.asarray(a).reshape((*lead, *a.shape[2:])), out)
     return ClosedLoops(
         trajectories=bypass_init(Trajectory, x=out.x, u=out.u, y=out.y),
         solved=(out.codes == SOLVED).all(axis=-1),
@@ -175,7 +175,9 @@ def mpc_rollout(
     many = controllers(system, cost, constraints, terminal)
     horizon, steps = positive_int("horizon", horizon), positive_int("steps", steps)
     begin, lead = starts(x0, system.nx, many)
-    out = _program(horizon, steps, derivative=True)(*many, many.systems, begin, tol)
+    out = _program(horizon, steps, derivative=True, thorough=many.sets is not None)(
+        *many, many.systems, begin, tol
+    )
     x, u, y = (a.reshape(*lead, *a.shape[2:]) for a in (out.x, out.u, out.y))
     return bypass_init(Trajectory, x=x, u=u, y=y)
 

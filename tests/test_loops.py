@@ -77,6 +77,19 @@ def test_loops_with_polyhedra_are_those_of_linear_mpc(end):
     assert matters >= 2
 
 
+def test_a_batch_never_calls_nan_solved():
+    """States beyond a limit on x_0 among others: XLA's max passes over NaN."""
+    wall = Polyhedron(np.eye(8)[[1]], [0.02])
+    x0 = np.zeros((25, 16, 6))
+    x0[..., 1], x0[..., 4] = np.linspace(-0.3, 0.03, 25)[:, None], np.linspace(-0.2, 0.25, 16)
+    x0 = x0.reshape(-1, 6)
+    sigma = QuadraticCost(QUADRATIC_Q, QUADRATIC_R)
+    loops = closed_loops(oscillating_masses(), sigma, x0, horizon=10, steps=2, constraints=wall)
+    finite = np.isfinite(loops.trajectories.u).all(axis=2)
+    np.testing.assert_array_equal(loops.status == "solved", finite)
+    assert (loops.status[x0[:, 1] > 0.02 + 1e-6] == "infeasible").all()
+
+
 def test_answers_with_polyhedra_are_those_of_linear_mpc():
     terminal = Polyhedron.box([-0.6] * 6, [0.6] * 6)
     costs = QuadraticCost([PAPER.Q, OTHER.Q], [PAPER.R, OTHER.R])

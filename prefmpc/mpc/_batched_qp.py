@@ -148,6 +148,9 @@ def _judged(
         apart = _correction(problem, data, V, multipliers)
         unit = jnp.max(problem.scale, axis=-1)[:, None]
         residual = jnp.maximum(jnp.abs(miss).max(-1), jnp.abs(apart).max(-1)) * unit
+        # XLA's max passes over NaN: what is not finite would look exact.
+        sound = jnp.isfinite(V).all(-1) & jnp.isfinite(multipliers).all(-1)
+        residual = jnp.where(sound, residual, jnp.inf)
         # Not the size of the multipliers: these grow without end where there is no solution.
         size = jnp.abs(data.free).max(-1) + jnp.abs(data.V).max(-1)
         done = (residual <= tol) | (residual <= 10 * ROUNDING * size * unit)
