@@ -52,6 +52,14 @@ def test_with_limits_on_the_states_too(results):
         assert row["status_differs"] == 0, row
 
 
+def test_random_programs_have_the_verdicts_of_clarabel(results):
+    found = results["solvers"]["programs"]
+    assert {row["ours"] for row in found["rows"]} == {"solved", "infeasible"}
+    assert all(row["ours"] == row["Clarabel"] for row in found["rows"])
+    assert found["finite"]
+    assert found["largest_difference"] < 1e-6
+
+
 def test_learners_of_one_problem_reach_one_minimum(results):
     rows = results["learning"]["by_size"]["rows"]
     convex = [row for row in rows if row["problem"] == "MAP"]
