@@ -25,7 +25,6 @@ from prefmpc.mpc.batched import (
     controllers,
     leading_axis,
     starts,
-    without_haste,
 )
 from prefmpc.sets import Polyhedron
 from prefmpc.systems import LinearSystem
@@ -126,13 +125,11 @@ def closed_loops(
     begin, lead = starts(x0, system.nx, many)
     mesh = None if mesh is None else check_mesh(mesh)
 
-    def run(thorough: bool) -> _Loop:
-        program = _program(horizon, steps, thorough=thorough)
-        if mesh is None:
-            return program(*many, truth, begin, tol)
-        return _shared(program, mesh, many, truth, begin, tol)
-
-    out = without_haste(many, run, lambda out: out.codes)
+    program = _program(horizon, steps)
+    if mesh is None:
+        out = program(*many, truth, begin, tol)
+    else:
+        out = _shared(program, mesh, many, truth, begin, tol)
     out = jax.tree.map(lambda a: np.asarray(a).reshape((*lead, *a.shape[2:])), out)
     return ClosedLoops(
         trajectories=bypass_init(Trajectory, x=out.x, u=out.u, y=out.y),
@@ -175,9 +172,7 @@ def mpc_rollout(
     many = controllers(system, cost, constraints, terminal)
     horizon, steps = positive_int("horizon", horizon), positive_int("steps", steps)
     begin, lead = starts(x0, system.nx, many)
-    out = _program(horizon, steps, derivative=True, thorough=many.sets is not None)(
-        *many, many.systems, begin, tol
-    )
+    out = _program(horizon, steps, derivative=True)(*many, many.systems, begin, tol)
     x, u, y = (a.reshape(*lead, *a.shape[2:]) for a in (out.x, out.u, out.y))
     return bypass_init(Trajectory, x=x, u=u, y=y)
 
@@ -209,9 +204,7 @@ def _with_plants(
 
 
 @lru_cache(maxsize=256)
-def _program(
-    horizon: int, steps: int, *, derivative: bool = False, thorough: bool = True
-) -> Callable[..., _Loop]:
+def _program(horizon: int, steps: int, *, derivative: bool = False) -> Callable[..., _Loop]:
     """Return the compiled simulation; one object for each size, so that it compiles once."""
 
     def step_of(
@@ -219,7 +212,7 @@ def _program(
     ) -> Callable[..., Any]:
         def step(now: Any, _: None) -> Any:
             x, before, start = now
-            answer = solve(problem, x, tol, start=start, thorough=thorough)
+            answer = solve(problem, x, tol, start=start)
             U = with_derivative(problem, x, answer) if derivative else answer.U
             u = jnp.where((answer.status == SOLVED)[..., None], U[..., : plants.nu], jnp.nan)
             code = jnp.where(before == SOLVED, answer.status, before)
@@ -233,7 +226,7 @@ def _program(
     def run(systems: Any, costs: Any, sets: Any, plants: Any, x0: Any, tol: Any) -> _Loop:
         many = Controllers(systems, costs, sets, stacked=True)
         problem = many.condensed(horizon)
-        rows = problem.dual.shape[-1]
+        rows = problem.Y.shape[1]
         start = x0, jnp.full(x0.shape[:2], SOLVED), jnp.zeros((*x0.shape[:2], rows))
         step = step_of(many, problem, plants, tol)
         _, (x, u, y, codes, iterations) = jax.lax.scan(step, start, None, length=steps)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import clarabel
 import jax
 import numpy as np
@@ -13,15 +11,15 @@ from prefmpc.mpc._batched_qp import solve
 from prefmpc.mpc._condensed import scaled
 
 
-@partial(jax.jit, static_argnums=6)
-def answers(H, q, lower, upper, G, h, thorough=True):
+@jax.jit
+def answers(H, q, lower, upper, G, h):
     """Solve min ½ vᵀHv + qᵀv over lower ≤ v ≤ upper, G v ≤ h, all with a leading axis."""
 
     def prepared(H, q, lower, upper, G, h):
         return scaled(H, q[:, None], lower, upper, (G, np.zeros((len(h), 1)), h))
 
     problems = jax.vmap(prepared)(H, q, lower, upper, G, h)
-    return solve(problems, np.ones((len(q), 1, 1)), 1e-8, thorough=thorough)
+    return solve(problems, np.ones((len(q), 1, 1)), 1e-8)
 
 
 def random_programs(count, n, rows, rng):

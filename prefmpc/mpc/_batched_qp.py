@@ -1,14 +1,15 @@
 """Many small quadratic programs side by side: c problems, each for k right-hand sides.
 
-min ½ VᵀHV + gᵀV over l ≤ G V ≤ u. Three methods, each for what the one before leaves over: the
-unconstrained minimum, where it is feasible; a primal-dual active-set method, exact and short; an
-interior-point method, which always arrives and tells what is infeasible.
+min ½‖w‖² over l ≤ E x_0 + Y w ≤ u. Three methods, each for what the one before leaves over: w = 0,
+where it is feasible; a primal-dual active-set method, exact and short; Goldfarb and Idnani's dual
+method, which always arrives and tells what is infeasible.
 
-The first two consist of products of matrices alone: conjugate gradients find the multipliers of
-the active rows, in as many steps as there are of these.
+The only unknowns are the multipliers λ of the rows: w = −Yᵀλ is optimal if the rows keep to their
+limits and only rows at their limits have multipliers, with the right sign.
 """
 
 from __future__ import annotations
+
 
 from typing import Any, NamedTuple
 
@@ -17,37 +18,40 @@ import jax.numpy as jnp
 import numpy as np
 
 from prefmpc.mpc._condensed import CondensedProblem
-from prefmpc.mpc._interior import interior_point
+from prefmpc.mpc._dual_method import dual_method
+from prefmpc.mpc._limits import ON_LIMIT, row_sizes
 
 BOX_STEPS = 120
 STEPS = 15
-PATIENCE = 5
+PATIENCE = 3
 """With polyhedra, a step after so many that finishes no problem is the last."""
 
 TRIES = 3
 """Changes of the whole active set that may be in vain before single ones are made."""
 
-POLISHING_STEPS = 6
-CHUNK = 8
-"""Problems that the interior-point method takes at a time."""
+CHUNK = 2**19
+"""Numbers in the arrays that the dual method works on at a time."""
 
-ROUNDING = 1e-14
-NOTHING = 1e-7
-"""Multipliers below, in the unit of the rows, do not say that a row was active."""
+ROUNDING = 1e-15
+FINEST = 1e-12
+"""Relative errors below are not asked for: rounding alone may be as large."""
 
-STATUSES = np.array(["solved", "infeasible", "max_iterations"])
-SOLVED, INFEASIBLE, UNFINISHED = range(3)
+NOTHING = 1e-9
+"""Multipliers below, relative to the largest, do not say that a row was active."""
+
+STATUSES = np.array(["solved", "infeasible", "max_iterations", "failed"])
+SOLVED, INFEASIBLE, UNFINISHED, FAILED = range(4)
 
 
 class Answer(NamedTuple):
     """Inputs U (c, k, n) and what is to be said of each of the (c, k) problems.
 
-    ``residual`` is a proven bound on ‖U − U*‖₂ where there are only input bounds; else the
-    largest violation of the optimality conditions, in the unit of the inputs. ``status`` is a
-    place in STATUSES.
+    ``residual`` estimates the largest error of U relative to its largest entry, each input in the
+    unit in which σ sees it. ``status`` is a place in STATUSES.
     """
 
     U: Any
+    w: Any
     multipliers: Any
     status: Any
     residual: Any
@@ -55,21 +59,17 @@ class Answer(NamedTuple):
 
 
 class _Data(NamedTuple):
-    """What stays the same while the problems are solved."""
+    """What stays the same while the problems are solved, all (c, k, m)."""
 
-    g: Any
+    free: Any
+    """Rows of the unconstrained minimum."""
     lower: Any
     upper: Any
-    V: Any
-    """The unconstrained minimum −H⁻¹g (c, k, n)."""
-    free: Any
-    """G V (c, k, m)"""
 
 
 class _Search(NamedTuple):
-    """Where the search for V and λ stands; the same leading axes (c, k), or (b,) in a chunk."""
+    """Where the search for λ stands; the same leading axes (c, k), or (b,) in a chunk."""
 
-    V: Any
     multipliers: Any
     rows: Any
     residual: Any
@@ -77,116 +77,95 @@ class _Search(NamedTuple):
     iterations: Any
 
 
-def solve(
-    problem: CondensedProblem, x0: Any, tol: Any, *, start: Any = None, thorough: bool = True
-) -> Answer:
+def solve(problem: CondensedProblem, x0: Any, tol: Any, *, start: Any = None) -> Answer:
     """Solve for the states x0 (c, k, nx). Derivatives: see `with_derivative`.
 
     ``start`` are multipliers (c, k, m) of a problem much like this one.
-    Without ``thorough`` what the active-set method leaves over stays unfinished; the program then
-    compiles in a third of the time.
     """
     problem, x0, start = jax.lax.stop_gradient((problem, x0, start))
-    data = _data(problem, x0)
-    dead = ~jnp.isfinite(data.g).all(-1)
-    start = jnp.zeros_like(data.free) if start is None else start
+    n = problem.Y.shape[-1]
+    data, impossible = _data(problem, x0)
+    dead = ~jnp.isfinite(data.free).all(-1) | impossible
     found = _active_set(problem, data, start, dead, tol)
-    infeasible = jnp.zeros_like(dead)
-    if thorough:
-        found, infeasible = jax.lax.cond(
-            jnp.all(found.done | dead),
-            lambda found: (found, infeasible),
-            lambda found: _left_over(problem, data, found, dead, tol),
-            found,
+    ended = jax.lax.cond(
+        jnp.all(found.done | dead),
+        lambda found: (found, dead & False, dead & False),
+        lambda found: _left_over(problem, data, found, dead, tol),
+        found,
+    )
+    found, infeasible, limited = ended
+    U = jnp.clip(found.rows, data.lower, data.upper)[..., :n] * problem.scale[:, None]
+    w = -(found.multipliers @ problem.Y)
+    status = jnp.where(
+        found.done & jnp.isfinite(U).all(-1),
+        SOLVED,
+        jnp.where(
+            impossible | infeasible, INFEASIBLE, jnp.where(limited, UNFINISHED, FAILED)
+        ),
+    )
+    return Answer(U, w, found.multipliers, status, found.residual, found.iterations)
+
+
+def _data(problem: CondensedProblem, x0: Any) -> tuple[_Data, Any]:
+    """Return the rows and their limits, and which states (c, k) break one that no input moves."""
+    free = x0 @ problem.E.swapaxes(1, 2)
+    lower, upper = (
+        jnp.broadcast_to(bound[:, None], free.shape) for bound in (problem.lower, problem.upper)
+    )
+    impossible = jnp.zeros(x0.shape[:2], bool)
+    if problem.fixed is not None:
+        fixed, n = problem.fixed, problem.Y.shape[-1]
+        still = fixed.rows[:, None]
+        size = jax.vmap(row_sizes)(fixed.A, fixed.B, fixed.u_size, x0, fixed.Hx, fixed.h)
+        beyond = free[..., n:] - upper[..., n:] > ON_LIMIT * size
+        impossible = (still & beyond).any(-1)
+        upper = jnp.concatenate(
+            [upper[..., :n], jnp.where(still, jnp.inf, upper[..., n:])], axis=-1
         )
-    n = problem.H.shape[-1]
-    U = jnp.clip(found.V, data.lower[..., :n], data.upper[..., :n]) * problem.scale[:, None]
-    status = jnp.where(found.done, SOLVED, jnp.where(infeasible, INFEASIBLE, UNFINISHED))
-    return Answer(U, found.multipliers, status, found.residual, found.iterations)
+    return _Data(free, lower, upper), impossible
 
 
-def _data(problem: CondensedProblem, x0: Any) -> _Data:
-    g = x0 @ problem.F.swapaxes(1, 2)
-    shift = 0.0 if problem.E is None else x0 @ problem.E.swapaxes(1, 2)
-    lower, upper = problem.lower[:, None] - shift, problem.upper[:, None] - shift
-    V = -g @ problem.inverse
-    free = _rows_of(problem, V)
-    lower, upper = (jnp.broadcast_to(bound, free.shape) for bound in (lower, upper))
-    return _Data(g, lower, upper, V, free)
-
-
-def _rows_of(problem: CondensedProblem, V: Any) -> Any:
-    return V if problem.G is None else V @ problem.G.swapaxes(1, 2)
-
-
-def _columns_of(problem: CondensedProblem, multipliers: Any) -> Any:
-    return multipliers if problem.G is None else multipliers @ problem.G
-
-
-def _plan(problem: CondensedProblem, data: _Data, multipliers: Any) -> Any:
-    """Return V = −H⁻¹(g + Gᵀλ)."""
-    return -(data.g + _columns_of(problem, multipliers)) @ problem.inverse
-
-
-def _correction(problem: CondensedProblem, data: _Data, V: Any, multipliers: Any) -> Any:
-    """Return how far V is from H⁻¹(g + Gᵀλ), with the sign that moves it there if subtracted."""
-    slope = V @ problem.H + data.g + _columns_of(problem, multipliers)
-    return slope @ problem.inverse
+def _moved(problem: CondensedProblem, multipliers: Any) -> Any:
+    """Return Y Yᵀλ, what multipliers take away from the rows."""
+    if problem.dual is not None:
+        return multipliers @ problem.dual
+    return (multipliers @ problem.Y) @ problem.Y.swapaxes(1, 2)
 
 
 def _judged(
-    problem: CondensedProblem, data: _Data, V: Any, multipliers: Any, count: Any, tol: Any
+    data: _Data, multipliers: Any, rows: Any, softness: Any, n: int, count: Any, tol: Any
 ) -> _Search:
-    """Say how far V and λ are from optimal, without trusting where they come from."""
-    rows = _rows_of(problem, V)
-    if problem.G is None:
-        V, residual, done = _certified(problem, data, rows, tol)
-    else:
-        # Zero where, and only where, the conditions for the optimum hold.
-        reach = _diagonal(problem) * multipliers
-        miss = jnp.clip(rows + reach, data.lower, data.upper) - rows
-        apart = _correction(problem, data, V, multipliers)
-        unit = jnp.max(problem.scale, axis=-1)[:, None]
-        residual = jnp.maximum(jnp.abs(miss).max(-1), jnp.abs(apart).max(-1)) * unit
-        # XLA's max passes over NaN: what is not finite would look exact.
-        sound = jnp.isfinite(V).all(-1) & jnp.isfinite(multipliers).all(-1)
-        residual = jnp.where(sound, residual, jnp.inf)
-        # Not the size of the multipliers: these grow without end where there is no solution.
-        size = jnp.abs(data.free).max(-1) + jnp.abs(data.V).max(-1)
-        done = (residual <= tol) | (residual <= 10 * ROUNDING * size * unit)
-    return _Search(V, multipliers, rows, residual, done, count)
+    """Say how far λ is from optimal, without trusting where it comes from.
 
-
-def _certified(problem: CondensedProblem, data: _Data, rows: Any, tol: Any) -> tuple[Any, Any, Any]:
-    """Take one projected gradient step: it proves how far the optimum is, if G = I.
-
-    With V⁺ = clip(V − ∇/L), the residual of the optimality conditions at V⁺ has norm at most
-    (L − μ)·‖V⁺ − V‖, and strong monotonicity turns that into ‖V⁺ − V*‖ ≤ (L − μ)/μ·‖V⁺ − V‖.
-    Weights that hardly see an input make μ so small that rounding alone exceeds ``tol``: a step
-    of rounding size is then as good as float64 can tell, and counts as done too.
+    Were the limits of the active rows where these rows are, λ would be optimal: ``miss`` is how
+    far the limits are from there. To move the rows onto them takes ‖Δw‖ ≤ √softness·‖miss‖, where
+    softness bounds 1/σ² for the least singular value σ of the active rows of Y. By duality the
+    optimum then is within twice that. What rounding may have done to rows counts as a miss too.
     """
-    V = jnp.clip(rows, data.lower, data.upper)
-    short = problem.step[:, None]
-    gradient = V @ problem.H + data.g
-    V_next = jnp.clip(V - short[..., None] * gradient, data.lower, data.upper)
-    step = jnp.linalg.norm(V_next - V, axis=-1)
-    distance = problem.amplification[:, None] * step
-    size = jnp.linalg.norm(V, axis=-1) + short * jnp.linalg.norm(data.g, axis=-1)
-    return V_next, distance, (distance <= tol) | (step <= ROUNDING * size)
+    miss = jnp.clip(rows + multipliers, data.lower, data.upper) - rows
+    active = multipliers != 0
+    size = jnp.abs(rows) + jnp.abs(data.free)
+    rounding = jnp.where(active, ROUNDING * size, 0.0)
+    miss = jnp.linalg.norm(jnp.abs(miss) + rounding, axis=-1)
+    error = jnp.sqrt(softness) * miss + ROUNDING * jnp.linalg.norm(multipliers, axis=-1)
+    inputs = jnp.maximum(jnp.abs(rows[..., :n]), 1e-6 * jnp.abs(data.free[..., :n]))
+    unit = inputs.max(-1)
+    residual = jnp.where(error > 0, error / jnp.where(unit > 0, unit, 1.0), 0.0)
+    residual = jnp.where((error > 0) & ~(unit > 0), jnp.inf, residual)
+    # XLA's max passes over NaN: what is not finite would look exact.
+    sound = jnp.isfinite(rows).all(-1) & jnp.isfinite(multipliers).all(-1)
+    residual = jnp.where(sound & jnp.isfinite(residual), residual, jnp.inf)
+    return _Search(multipliers, rows, residual, residual <= jnp.maximum(tol, FINEST), count)
 
 
-def _diagonal(problem: CondensedProblem) -> Any:
-    return jnp.diagonal(problem.dual, axis1=1, axis2=2)[:, None]
-
-
-def _active(data: _Data, reach: Any, rows: Any) -> tuple[Any, Any]:
+def _active(data: _Data, multipliers: Any, rows: Any) -> tuple[Any, Any]:
     """Return which rows are taken to be at their upper limits, and which at their lower ones.
 
-    ``reach`` are the multipliers, in the unit of the rows: what a row would be without its own
-    one. A row at one limit that pulls the wrong way becomes free; it does not jump to the other.
+    Rows have unit length: a multiplier is what a row would be without it. A row at one limit that
+    pulls the wrong way becomes free; it does not jump to the other.
     """
     half = (data.upper - data.lower) / 2
-    alone = rows + jnp.clip(reach, -half, half)
+    alone = rows + jnp.clip(multipliers, -half, half)
     high = alone >= data.upper
     return high, (alone <= data.lower) & ~high
 
@@ -232,43 +211,50 @@ def _active_set(problem: CondensedProblem, data: _Data, start: Any, dead: Any, t
     Hintermüller, Ito and Kunisch's primal-dual active-set method. Where the guess repeats itself
     it is exact. The first guess is what was active at ``start``, if anything was.
     """
-    pull = _diagonal(problem) * start
-    pushed, pulled = pull > NOTHING, pull < -NOTHING
+    n = problem.Y.shape[-1]
+    none, count = jnp.zeros_like(data.free), jnp.zeros(dead.shape, dtype=int)
+    start = none if start is None else start
+    least = NOTHING * jnp.abs(start).max(-1, keepdims=True)
+    pushed, pulled = start > least, start < -least
     warm = jnp.any(pushed | pulled, axis=-1, keepdims=True)
-    n = problem.H.shape[-1]
-    steps, patience = (BOX_STEPS, BOX_STEPS) if problem.G is None else (STEPS, PATIENCE)
+    box = problem.fixed is None
+    steps, patience = (BOX_STEPS, BOX_STEPS) if box else (STEPS, PATIENCE)
 
     def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        k, now, guess, idle, _ = carry
-        high, low = _active(data, _diagonal(problem) * now.multipliers, now.rows)
+        k, now, guess, idle, _, softness = carry
+        high, low = _active(data, now.multipliers, now.rows)
         first = warm & (k == 0)
         high, low = jnp.where(first, pushed, high), jnp.where(first, pulled, low)
-        guess = _next_guess(guess, high, low)
+        last, guess = guess, _next_guess(guess, high, low)
         # More active rows than inputs depend on each other: too hard a case for this method.
         both = guess.high | guess.low
         idle |= now.done | (jnp.sum(both, axis=-1) > n)
         active = both & ~idle[..., None]
+        # From where λ is: repeated with the same rows it removes rounding errors.
         kept = jnp.where(active, now.multipliers, 0.0)
-        # Newton's step from where V is: repeated with the same rows it removes rounding errors.
-        V = now.V - _correction(problem, data, now.V, kept)
-        excess = _excess(data, _rows_of(problem, V), guess.high, guess.low)
-        rest = jnp.where(active, excess, 0.0)
-        limits = jnp.where(active, jnp.abs(now.rows) + 1, 0.0)
-        exact = 1e-13 * jnp.linalg.norm(limits, axis=-1)
-        more = _conjugate_gradients(problem.dual, active, rest, exact, limit=2 * n)
-        V -= _columns_of(problem, more) @ problem.inverse
-        new = _kept(idle, now, _judged(problem, data, V, kept + more, now.iterations + 1, tol))
-        return k + 1, new, guess, idle | new.done, jnp.all(new.done == now.done)
+        rows = data.free - _moved(problem, kept)
+        rest = jnp.where(active, _excess(data, rows, guess.high, guess.low), 0.0)
+        sizes = jnp.where(active, jnp.abs(data.free) + jnp.abs(rows), 0.0)
+        exact = 10 * ROUNDING * jnp.linalg.norm(sizes, axis=-1)
+        more, found = _conjugate_gradients(problem, active, rest, exact, limit=2 * n)
+        # With the same rows as before there is little left to do, and little to learn from it.
+        same = ((last.high == guess.high) & (last.low == guess.low)).all(-1)
+        softness = jnp.where(same, jnp.maximum(found, softness), found)
+        rows -= _moved(problem, more)
+        new = _judged(data, kept + more, rows, softness, n, now.iterations + 1, tol)
+        new = _kept(idle, now, new)
+        return k + 1, new, guess, idle | new.done, jnp.all(new.done == now.done), softness
 
     def unfinished(carry: tuple[Any, ...]) -> Any:
-        k, _, _, idle, stuck = carry
+        k, _, _, idle, stuck, _ = carry
         return (k < steps) & ~jnp.all(idle) & ~((k >= patience) & stuck)
 
-    none, count = jnp.zeros_like(data.free), jnp.zeros(dead.shape, dtype=int)
-    free = _judged(problem, data, data.V, none, count, tol)
+    one = jnp.ones(dead.shape)
+    free = _judged(data, none, data.free, one, n, count, tol)
     nowhere = jnp.zeros_like(data.free, dtype=bool)
     guess = _Guess(nowhere, nowhere, jnp.full(dead.shape, none.shape[-1] + 1), count + TRIES)
-    return jax.lax.while_loop(unfinished, step, (0, free, guess, dead | free.done, False))[1]
+    begin = (0, free, guess, dead | free.done, False, one)
+    return jax.lax.while_loop(unfinished, step, begin)[1]
 
 
 def _kept(keep: Any, old: Any, new: Any) -> Any:
@@ -280,130 +266,114 @@ def _kept(keep: Any, old: Any, new: Any) -> Any:
     return jax.tree.map(choose, old, new)
 
 
-def _conjugate_gradients(dual: Any, active: Any, rest: Any, exact: Any, limit: int) -> Any:
-    """Return λ, zero outside of the active rows, with dual·λ = rest on these."""
+def _conjugate_gradients(
+    problem: CondensedProblem, active: Any, rest: Any, exact: Any, limit: int
+) -> tuple[Any, Any]:
+    """Return λ, zero outside of the active rows, with Y Yᵀλ = rest on these; and their softness.
+
+    The method builds a tridiagonal matrix whose eigenvalues approach those of Y Yᵀ on the active
+    rows: the trace of its inverse is at least 1 over the least of them.
+    """
 
     def unfinished(carry: tuple[Any, ...]) -> Any:
         return (carry[0] < limit) & jnp.any(carry[4] > exact**2)
 
     def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        k, multipliers, rest, way, square = carry
-        turned = jnp.where(active, way @ dual, 0.0)
+        k, multipliers, rest, way, square, inverse, trace = carry
+        turned = jnp.where(active, _moved(problem, way), 0.0)
         bend = jnp.sum(way * turned, axis=-1)
-        far = jnp.where(bend > 0, square / jnp.where(bend > 0, bend, 1.0), 0.0)[..., None]
-        multipliers, rest = multipliers + far * way, rest - far * turned
-        next_square = jnp.sum(rest * rest, axis=-1)
-        ratio = jnp.where(square > 0, next_square / jnp.where(square > 0, square, 1.0), 0.0)
-        return k + 1, multipliers, rest, rest + ratio[..., None] * way, next_square
+        go = (bend > 0) & (square > exact**2)
+        far = jnp.where(go, square / jnp.where(go, bend, 1.0), 0.0)
+        inverse += jnp.where(go, 1 / jnp.where(go, square, 1.0), 0.0)
+        trace += far * square * inverse
+        multipliers, rest = multipliers + far[..., None] * way, rest - far[..., None] * turned
+        next_square = jnp.where(go, jnp.sum(rest * rest, axis=-1), square)
+        ratio = jnp.where(go, next_square / jnp.where(go, square, 1.0), 0.0)
+        way = jnp.where(go[..., None], rest + ratio[..., None] * way, way)
+        return k + 1, multipliers, rest, way, next_square, inverse, trace
 
     square = jnp.sum(rest * rest, axis=-1)
-    start = (0, jnp.zeros_like(rest), rest, rest, square)
-    return jax.lax.while_loop(unfinished, step, start)[1]
+    nothing = jnp.zeros_like(square)
+    start = (0, jnp.zeros_like(rest), rest, rest, square, nothing, nothing)
+    _, multipliers, *_, trace = jax.lax.while_loop(unfinished, step, start)
+    return multipliers, jnp.maximum(trace, 1.0)
 
 
 def _left_over(
     problem: CondensedProblem, data: _Data, found: _Search, dead: Any, tol: Any
-) -> tuple[_Search, Any]:
-    """Solve what is left over by the interior-point method, gathered in front, chunk by chunk."""
+) -> tuple[_Search, Any, Any]:
+    """Solve what is left over by the dual method, gathered in front, chunk by chunk."""
     c, k = dead.shape
+    m, n = problem.Y.shape[1:]
     lanes = c * k
-    chunk = min(CHUNK, lanes)
+    chunk = max(1, min(CHUNK // (n * n + (m * n if c > 1 else m)), lanes, 64))
     one_row = jax.tree.map(lambda a: a.reshape(lanes, *a.shape[2:]), (data, found))
     finished = (found.done | dead).ravel()
     order = jnp.argsort(finished)
     order = jnp.concatenate([order, order[:1].repeat(chunk)])
     left = jnp.sum(~finished)
 
-    def work(carry: tuple[Any, _Search, Any]) -> tuple[Any, _Search, Any]:
-        i, out, infeasible = carry
+    def work(carry: tuple[Any, _Search, Any, Any]) -> tuple[Any, _Search, Any, Any]:
+        i, out, infeasible, limited = carry
         lane = jax.lax.dynamic_slice(order, (i,), (chunk,))
         skip = i + jnp.arange(chunk) >= left
         mine, before = jax.tree.map(lambda a: a[lane], one_row)
-        own = jax.tree.map(lambda a: a[lane // k], problem)
-        new, proven = _by_interior_point(own, mine, before.iterations, skip, tol)
+        own = lane // k
+        dual = dual_method(problem.Y, own, mine.free, mine.lower, mine.upper, skip)
+        new = _judged_alone(problem.Y, own, mine, dual, n, before.iterations, tol)
+        # Two methods have tried: what was found last is kept if it is the better one.
+        new = _kept(~(new.residual < before.residual), before, new)
         place = jnp.where(skip, lanes, lane)  # out of bounds: dropped
 
         def put(old: Any, new: Any) -> Any:
             return old.at[place].set(new, mode="drop")
 
-        return i + chunk, jax.tree.map(put, out, new), put(infeasible, proven)
+        out = jax.tree.map(put, out, new)
+        said = dual.infeasible & ~new.done, dual.limited & ~new.done
+        return i + chunk, out, put(infeasible, said[0]), put(limited, said[1])
 
-    start = 0, one_row[1], jnp.zeros(lanes, dtype=bool)
-    _, out, infeasible = jax.lax.while_loop(lambda carry: carry[0] < left, work, start)
-    return jax.tree.map(lambda a: a.reshape(c, k, *a.shape[1:]), out), infeasible.reshape(c, k)
-
-
-def _by_interior_point(
-    problem: CondensedProblem, data: _Data, count: Any, skip: Any, tol: Any
-) -> tuple[_Search, Any]:
-    """Solve b problems, each with matrices of its own; polish by exact active-set steps."""
-    n = problem.H.shape[-1]
-    G = jnp.broadcast_to(jnp.eye(n), problem.H.shape) if problem.G is None else problem.G
-    found = interior_point(problem.H, data.g, G, data.lower, data.upper, skip)
-    count = count + found.count
-
-    def judged(V: Any, multipliers: Any) -> _Search:
-        single = jax.tree.map(lambda a: a[:, None], (data, V, multipliers, count))
-        given, V, multipliers, steps = single
-        answer = _judged(problem, given, V, multipliers, steps, tol)
-        return jax.tree.map(lambda a: a[:, 0], answer)
-
-    start = judged(found.x, found.multipliers)
-    settled = skip | found.infeasible
-
-    def polish(carry: tuple[Any, _Search, _Search]) -> tuple[Any, _Search, _Search]:
-        k, now, best = carry
-        reach = jnp.diagonal(problem.dual, axis1=1, axis2=2) * now.multipliers
-        now = judged(*_on_limits(problem.H, G, data, *_active(data, reach, now.rows)))
-        return k + 1, now, _kept(~(now.residual < best.residual), best, now)
-
-    _, _, best = jax.lax.while_loop(
-        lambda carry: (
-            (carry[0] < POLISHING_STEPS) & ((carry[0] == 0) | ~jnp.all(settled | carry[2].done))
-        ),
-        polish,
-        (0, start, start),
-    )
-    return best, found.infeasible & ~best.done
+    no = jnp.zeros(lanes, dtype=bool)
+    start = 0, one_row[1], no, no
+    _, out, infeasible, limited = jax.lax.while_loop(lambda carry: carry[0] < left, work, start)
+    shaped = jax.tree.map(lambda a: a.reshape(c, k, *a.shape[1:]), out)
+    return shaped, infeasible.reshape(c, k), limited.reshape(c, k)
 
 
-def _on_limits(H: Any, G: Any, data: _Data, high: Any, low: Any) -> tuple[Any, Any]:
-    """Return the optimal V and λ with the active rows held at their limits."""
-    active = high | low
-    n = data.g.shape[1]
-    held = jnp.where(active[..., None], G, 0.0)
-    corner = jnp.where(active, 0.0, 1.0)[..., None] * jnp.eye(active.shape[1])
-    top = jnp.concatenate([H, held.swapaxes(1, 2)], axis=2)
-    matrix = jnp.concatenate([top, jnp.concatenate([held, corner], axis=2)], axis=1)
-    limits = jnp.where(high, data.upper, jnp.where(low, data.lower, 0.0))
-    right = jnp.concatenate([-data.g, limits], axis=1)
-    solution = jnp.linalg.solve(matrix, right[..., None])[..., 0]
-    return solution[:, :n], solution[:, n:]
+def _judged_alone(
+    Y: Any, own: Any, data: _Data, dual: Any, n: int, count: Any, tol: Any
+) -> _Search:
+    """Judge b problems of different controllers."""
+    if len(Y) == 1:
+        rows = data.free - (dual.multipliers @ Y[0]) @ Y[0].T
+    else:
+        mine = Y[own]
+        w = jnp.einsum("bmn,bm->bn", mine, dual.multipliers)
+        rows = data.free - jnp.einsum("bmn,bn->bm", mine, w)
+    return _judged(data, dual.multipliers, rows, dual.softness, n, count + dual.count, tol)
 
 
 def with_derivative(problem: CondensedProblem, x0: Any, answer: Answer) -> Any:
     """Return U (c, k, n) again, as a function of problem and x0 that can be differentiated.
 
-    The active rows stay active nearby: U moves with the solution of the equations
-    H V + g + Gᵀλ = 0 and G V = limit on these.
+    The active rows stay active nearby: U moves with the solution of Y w + E x_0 = limit on these,
+    w = −Yᵀλ.
     """
-    fixed, start = jax.lax.stop_gradient((problem, x0))
-    known = _data(fixed, start)
-    rows = known.free - answer.multipliers @ fixed.dual
-    high, low = _active(known, _diagonal(fixed) * answer.multipliers, rows)
-    active = high | low
-    data = _data(problem, x0)
+    fixed = jax.lax.stop_gradient(problem)
+    n = problem.Y.shape[-1]
+    active = answer.multipliers != 0
+    high, low = answer.multipliers > 0, answer.multipliers < 0
+    data, _ = _data(problem, x0)
 
     def on_active(multipliers: Any) -> Any:
-        return jnp.where(active, multipliers @ problem.dual, multipliers)
+        return jnp.where(active, _moved(problem, multipliers), multipliers)
 
     def solved(_: Any, right: Any) -> Any:
         inside = jnp.where(active, right, 0.0)
         exact = 1e-13 * jnp.linalg.norm(inside, axis=-1)
-        found = _conjugate_gradients(fixed.dual, active, inside, exact, 2 * inside.shape[-1])
+        found, _ = _conjugate_gradients(fixed, active, inside, exact, 2 * n)
         return jnp.where(active, found, right)
 
     excess = _excess(data, data.free, high, low)
     multipliers = jax.lax.custom_linear_solve(on_active, excess, solved, symmetric=True)
-    moving = _plan(problem, data, multipliers) * problem.scale[:, None]
+    moving = (data.free - _moved(problem, multipliers))[..., :n] * problem.scale[:, None]
     return answer.U + moving - jax.lax.stop_gradient(moving)

@@ -1,4 +1,10 @@
-"""MPC with the states eliminated: a quadratic program in the inputs, for a batch of controllers."""
+"""MPC with the states eliminated, in coordinates that keep all digits, for a batch of controllers.
+
+The inputs are U = E x_0 + Y w: the unconstrained plan, which is the closed loop of the LQR of the
+same horizon, and what is added to it. With w in the unit of √σ the cost is ½‖w‖² and a constant.
+The Hessian of the condensed problem is (Y Yᵀ)⁻¹, and never formed: on an unstable plant it grows
+with A to the power of 2N, while Y consists of responses of a closed loop.
+"""
 
 from __future__ import annotations
 
@@ -6,13 +12,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from prefmpc.models import QuadraticCost
+from prefmpc.mpc._limits import MOVES, input_size
 from prefmpc.systems import LinearSystem
-
-ON_LIMIT = 1e-6
-"""How far beyond a limit x_0 may be, in the unit of the limit, to count as on it."""
 
 
 class Sets(NamedTuple):
@@ -26,84 +29,149 @@ class Sets(NamedTuple):
     """x_NᵀPx_N is added to σ."""
 
 
-class CondensedProblem(NamedTuple):
-    """min ½ VᵀHV + (F x_0)ᵀV over lower − E x_0 ≤ G V ≤ upper − E x_0; the inputs are scale·V.
+class Law(NamedTuple):
+    """u_k = −K_k x_k + L_kᵀ w_k: the inputs as the states along a plan ask for them."""
 
-    The first N·nu rows of G are the identity: the input bounds. H has a unit diagonal, the other
-    rows of G have unit length. G and E are None if there is nothing but input bounds.
+    K: Any
+    L: Any
+
+
+class Fixed(NamedTuple):
+    """Rows that no input moves are conditions on x_0; the rest says what counts as on the limit."""
+
+    rows: Any
+    """Which of the rows (r,) beside the inputs these are."""
+    A: Any
+    B: Any
+    u_size: Any
+    Hx: Any
+    """The rows in the states (r, nx), see `row_sizes`."""
+    h: Any
+    unit: Any
+    """What the rows were divided by (r,)."""
+
+
+class CondensedProblem(NamedTuple):
+    """min ½‖w‖² over lower ≤ E x_0 + Y w ≤ upper; the first N·nu rows are the inputs / scale.
+
+    All rows of Y have unit length, except for those that no input moves, which are zero.
     """
 
-    H: Any
-    inverse: Any
-    """H⁻¹"""
-    dual: Any
-    """G H⁻¹ Gᵀ (m, m): how far one row moves when the multiplier of another grows."""
-    F: Any
-    G: Any
+    Y: Any
     E: Any
     lower: Any
     upper: Any
     scale: Any
-    amplification: Any
-    """How much farther than a projected gradient step the optimum may be, in units of the input."""
-    step: Any
-    """1/L: the length of a safe gradient step."""
-
-
-def responses(system: LinearSystem, horizon: int) -> tuple[Any, Any]:
-    """Return Φ (N + 1, nx, nx) and Γ (N + 1, nx, N·nu): x_k = Φ_k x_0 + Γ_k U."""
-    A, B = jnp.asarray(system.A), jnp.asarray(system.B)
-    _, Phi = jax.lax.scan(lambda P, _: (A @ P, P), jnp.eye(system.nx), None, length=horizon + 1)
-    delay = np.arange(horizon + 1)[:, None] - np.arange(horizon) - 1  # steps from u_j until x_k
-    blocks = jnp.where(delay[..., None, None] >= 0, (Phi @ B)[np.maximum(delay, 0)], 0.0)
-    return Phi, blocks.swapaxes(1, 2).reshape(horizon + 1, system.nx, horizon * system.nu)
+    dual: Any
+    """Y Yᵀ, how far one row moves when the multiplier of another grows; None if it is large."""
+    fixed: Fixed | None
+    law: Law | None
 
 
 @jax.custom_jvp
-def inverse_of(H: Any) -> Any:
-    """Return H⁻¹ of a positive definite matrix."""
-    root = jax.lax.linalg.triangular_solve(
-        jax.lax.linalg.cholesky(H, symmetrize_input=False),
-        jnp.eye(H.shape[-1]),
+def inverse_root(M: Any) -> Any:
+    """Return L⁻¹ for a positive definite M = L Lᵀ."""
+    return jax.lax.linalg.triangular_solve(
+        jax.lax.linalg.cholesky(M, symmetrize_input=False),
+        jnp.broadcast_to(jnp.eye(M.shape[-1]), M.shape),
         left_side=True,
         lower=True,
     )
-    return root.T @ root
 
 
-@inverse_of.defjvp
-def _inverse_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
+@inverse_root.defjvp
+def _inverse_root_jvp(primals: tuple[Any], tangents: tuple[Any]) -> tuple[Any, Any]:
     # By products alone: LAPACK calls that do not depend on each other can wait for each other
     # forever in a thread pool of two.
-    inverse = inverse_of(primals[0])
-    return inverse, -inverse @ tangents[0] @ inverse
-
-
-def _largest_eigenvalue(H: Any) -> Any:
-    """Return an upper bound, at most n^{1/8} times too high: the largest row sum of H⁸, ^(1/8)."""
-    size = jnp.abs(H).sum(-1).max(-1)
-    power = H / size
-    for _ in range(3):
-        power = power @ power
-    return size * jnp.abs(power).sum(-1).max(-1) ** 0.125
+    root = inverse_root(primals[0])
+    turned = root @ tangents[0] @ root.swapaxes(-1, -2)
+    half = jnp.tril(turned) - turned * jnp.eye(turned.shape[-1]) / 2
+    return root, -half @ root
 
 
 def condense(
     system: LinearSystem, cost: QuadraticCost, horizon: int, sets: Sets | None = None
 ) -> CondensedProblem:
     """Eliminate the states of eq. (7) or (12) of arXiv 2511.22502 for one controller."""
-    Phi, Gamma = responses(system, horizon)
-    Q = jnp.broadcast_to(cost.Q, (horizon, *cost.Q.shape))
     P = jnp.zeros_like(cost.Q) if sets is None or sets.P is None else sets.P
-    weighted = jnp.concatenate([Q, P[None]]) @ Gamma
-    n = horizon * system.nu
-    columns, flat = Gamma.reshape(-1, n), weighted.reshape(-1, n)
-    H = 2 * (columns.T @ flat + jnp.kron(jnp.eye(horizon), cost.R))
-    F = 2 * flat.T @ Phi.reshape(-1, system.nx)
+    law = _law(system, cost, horizon, P)
+    rows = Sets(None, None, None, None, None) if sets is None else sets
+    Y, E = _responses(system, law, rows)
     lower, upper = (jnp.tile(bound, horizon) for bound in (system.u_min, system.u_max))
-    if sets is None or (sets.stage is None and sets.last is None):
-        return scaled(H, F, lower, upper)
-    return scaled(H, F, lower, upper, _rows(sets, Phi, Gamma, system.nu))
+    limits, states, still = [], [], []
+    if rows.stage is not None:
+        Hx, Hu = rows.stage[:, : system.nx], rows.stage[:, system.nx :]
+        limits.append(jnp.tile(rows.stage_limit, horizon))
+        states.append(jnp.tile(Hx, (horizon, 1)))
+        still.append(_unmoved(system, Hx, Hu, horizon).ravel())
+    if rows.last is not None:
+        limits.append(rows.last_limit)
+        states.append(rows.last)
+        still.append(_unmoved(system, rows.last, None, horizon + 1)[-1])
+    if not limits:
+        return _normalised(Y, E, lower, upper, None, law)
+    h, unit = jnp.concatenate(limits), jnp.ones(())
+    size = input_size(system.u_min, system.u_max)
+    fixed = Fixed(
+        jnp.concatenate(still), system.A, system.B, size, jnp.concatenate(states), h, unit
+    )
+    lower = jnp.concatenate([lower, jnp.full(len(h), -jnp.inf)])
+    return _normalised(Y, E, lower, jnp.concatenate([upper, h]), fixed, law)
+
+
+def _law(system: LinearSystem, cost: QuadraticCost, horizon: int, P: Any) -> Law:
+    """Return the LQR of the horizon, by the Riccati recursion in Joseph's form."""
+    A, B, Q, R = system.A, system.B, cost.Q, cost.R
+
+    def back(P: Any, _: None) -> tuple[Any, Law]:
+        L = inverse_root(2 * (R + B.T @ P @ B))
+        K = L.T @ (L @ (2 * B.T @ P @ A))
+        closed = A - B @ K
+        P = Q + K.T @ R @ K + closed.T @ P @ closed
+        return (P + P.T) / 2, Law(K, L)
+
+    return jax.lax.scan(back, jnp.asarray(P), None, length=horizon, reverse=True)[1]
+
+
+def _responses(system: LinearSystem, law: Law, sets: Sets) -> tuple[Any, Any]:
+    """Return Y (m, n) and E (m, nx): inputs first, then the rows of the stages, then the last."""
+    A, B, nx, nu = system.A, system.B, system.nx, system.nu
+    horizon = len(law.K)
+    n = horizon * nu
+
+    def step(X: Any, now: tuple[Any, Any, Any]) -> tuple[Any, Any]:
+        K, L, here = now
+        own = jnp.concatenate([jnp.kron(here, L.T), jnp.zeros((nu, nx))], axis=1)
+        U = own - K @ X
+        rows = None
+        if sets.stage is not None:
+            rows = sets.stage[:, :nx] @ X + sets.stage[:, nx:] @ U
+        return A @ X + B @ U, (U, rows)
+
+    # The columns are those of w, then those of x_0.
+    start = jnp.concatenate([jnp.zeros((nx, n)), jnp.eye(nx)], axis=1)
+    last, (U, rows) = jax.lax.scan(step, start, (law.K, law.L, jnp.eye(horizon)))
+    parts = [U.reshape(-1, n + nx)]
+    if rows is not None:
+        parts.append(rows.reshape(-1, n + nx))
+    if sets.last is not None:
+        parts.append(sets.last @ last)
+    both = jnp.concatenate(parts)
+    return both[:, :n], both[:, n:]
+
+
+def _unmoved(system: LinearSystem, Hx: Any, Hu: Any, stages: int) -> Any:
+    """Do what `prefmpc.mpc._limits.unmoved` does, inside of a compiled program."""
+    A, B = system.A, system.B
+
+    def step(carry: tuple[Any, Any, Any], _: None) -> tuple[tuple[Any, Any, Any], Any]:
+        blind, row, size = carry
+        moves = (jnp.abs(row @ B) > MOVES * (size @ jnp.abs(B))).any(axis=1)
+        return (blind & ~moves, row @ A, size @ jnp.abs(A)), blind
+
+    blind = jnp.ones(len(Hx), bool) if Hu is None else ~(jnp.asarray(Hu) != 0).any(axis=1)
+    start = blind, jnp.asarray(Hx), jnp.abs(jnp.asarray(Hx))
+    return jax.lax.scan(step, start, None, length=stages)[1]
 
 
 def scaled(
@@ -113,56 +181,35 @@ def scaled(
 
     ``rows`` are G (r, n), E (r, nx) and limits (r,).
     """
-    n = len(H)
-    scale = 1 / jnp.sqrt(jnp.diag(H))
-    H = (H * scale).T * scale
-    H = (H + H.T) / 2
-    inverse = inverse_of(H)
-    lower, upper = lower / scale, upper / scale
-    G = E = None
-    dual = inverse
-    if rows is not None:
-        G, E, limits = rows
-        # The unit of a row changes no solution: it needs no derivative.
-        length = jax.lax.stop_gradient(jnp.linalg.norm(G * scale, axis=1))
-        # What no input moves is a condition on x_0: one that lies on a limit keeps to it, even if
-        # rounding has pushed it over.
-        moves = length > 1e-12
-        limits = limits + jnp.where(moves, 0.0, ON_LIMIT)
-        length = jnp.where(moves, length, 1.0)[:, None]
-        G = jnp.concatenate([jnp.eye(n), G * scale / length])
-        E = jnp.concatenate([jnp.zeros((n, E.shape[1])), E / length])
-        lower = jnp.concatenate([lower, jnp.full(len(limits), -jnp.inf)])
-        upper = jnp.concatenate([upper, limits / length[:, 0]])
-        dual = G @ inverse @ G.T
-    largest, least = _largest_eigenvalue(H), 1 / _largest_eigenvalue(inverse)
-    return CondensedProblem(
-        H=H,
-        inverse=inverse,
-        dual=dual,
-        F=F * scale[:, None],
-        G=G,
-        E=E,
-        lower=lower,
-        upper=upper,
-        scale=scale,
-        amplification=jax.lax.stop_gradient((largest / least - 1) * jnp.max(scale)),
-        step=jax.lax.stop_gradient(1 / largest),
-    )
+    unit = 1 / jnp.sqrt(jnp.diag(H))
+    root = inverse_root((H * unit).T * unit)
+    Y = root.T * unit[:, None]
+    plan = -Y @ (Y.T @ F)
+    if rows is None:
+        return _normalised(Y, plan, lower, upper, None, None)
+    G, E, limits = rows
+    nx = F.shape[1]
+    still = jnp.linalg.norm(G @ Y, axis=1) <= MOVES * (jnp.abs(G) @ jnp.linalg.norm(Y, axis=1))
+    nothing = jnp.zeros((nx, nx)), jnp.zeros((nx, 1)), jnp.zeros(1)
+    fixed = Fixed(still, *nothing, E, limits, jnp.ones(()))
+    lower = jnp.concatenate([lower, jnp.full(len(limits), -jnp.inf)])
+    upper = jnp.concatenate([upper, limits])
+    both = jnp.concatenate([plan, E + G @ plan])
+    return _normalised(jnp.concatenate([Y, G @ Y]), both, lower, upper, fixed, None)
 
 
-def _rows(sets: Sets, Phi: Any, Gamma: Any, nu: int) -> tuple[Any, Any, Any]:
-    """Return G, E, limits of the rows G U ≤ limits − E x_0 that the polyhedra make."""
-    horizon, nx, n = len(Phi) - 1, Phi.shape[1], Gamma.shape[-1]
-    G, E, limits = [], [], []
-    if sets.stage is not None:
-        Hx, Hu = sets.stage[:, :nx], sets.stage[:, nx:]
-        now = jnp.eye(n).reshape(horizon, nu, n)
-        G.append((Hx @ Gamma[:-1] + Hu @ now).reshape(-1, n))
-        E.append((Hx @ Phi[:-1]).reshape(-1, nx))
-        limits.append(jnp.tile(sets.stage_limit, horizon))
-    if sets.last is not None:
-        G.append(sets.last @ Gamma[-1])
-        E.append(sets.last @ Phi[-1])
-        limits.append(sets.last_limit)
-    return jnp.concatenate(G), jnp.concatenate(E), jnp.concatenate(limits)
+def _normalised(
+    Y: Any, E: Any, lower: Any, upper: Any, fixed: Fixed | None, law: Law | None
+) -> CondensedProblem:
+    """Give the rows unit length."""
+    # The unit of a row changes no solution: it needs no derivative.
+    length = jax.lax.stop_gradient(jnp.linalg.norm(Y, axis=1))
+    n = Y.shape[1]
+    if fixed is not None:
+        still = jnp.concatenate([jnp.zeros(n, bool), fixed.rows | (length[n:] == 0)])
+        length = jnp.where(still, 1.0, length)
+        Y = jnp.where(still[:, None], 0.0, Y)
+        fixed = fixed._replace(rows=still[n:], unit=length[n:])
+    Y, E = Y / length[:, None], E / length[:, None]
+    dual = Y @ Y.T if len(Y) <= 2 * n else None
+    return CondensedProblem(Y, E, lower / length, upper / length, length[:n], dual, fixed, law)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from prefmpc._checks import array_module, nonnegative, positive_int
 from prefmpc._pytree import bypass_init
 from prefmpc.models import QuadraticCost
-from prefmpc.mpc._batched_qp import SOLVED, STATUSES, UNFINISHED, Answer, solve
+from prefmpc.mpc._batched_qp import SOLVED, STATUSES, Answer, solve
 from prefmpc.mpc._condensed import CondensedProblem, Sets, condense
 from prefmpc.mpc.solution import (
     Controller,
@@ -30,7 +30,6 @@ from prefmpc.systems import LinearSystem
 from prefmpc.trajectories import Trajectory
 
 Terminal = Polyhedron | TerminalIngredients
-T = TypeVar("T")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -135,34 +134,33 @@ def starts(x0: ArrayLike, nx: int, many: Controllers) -> tuple[Any, tuple[int, .
     return array_module(x).broadcast_to(flat, (count, *flat.shape)), lead
 
 
-def without_haste(many: Controllers, run: Callable[[bool], T], status: Callable[[T], Any]) -> T:
-    """Return run(thorough): with input bounds alone a program without the last resort comes first.
-
-    It compiles sooner, and is hardly ever left with something to do.
-    """
-    if many.sets is None:
-        out = run(False)
-        if not (np.asarray(status(out)) == UNFINISHED).any():
-            return out
-    return run(True)
-
-
-@jax.jit(static_argnums=(1, 4))
+@jax.jit(static_argnums=1)
 def _solve_many(
-    parts: tuple[Any, Any, Any], horizon: int, x0: Any, tol: Any, thorough: bool
+    parts: tuple[Any, Any, Any], horizon: int, x0: Any, tol: Any
 ) -> tuple[Answer, Trajectory, Any]:
     """Return the answers, the plans (c, m) and their costs, NaN where not solved."""
     many = Controllers(*parts, True)
     plant, given = many.systems, many.sets
-    answer = solve(many.condensed(horizon), x0, tol, thorough=thorough)
+    problem = many.condensed(horizon)
+    answer = solve(problem, x0, tol)
     solved = (answer.status == SOLVED)[..., None]
-    U = jnp.where(solved, answer.U, jnp.nan).reshape(*x0.shape[:2], horizon, plant.nu)
+    shape = (*x0.shape[:2], horizon, plant.nu)
+    U = jnp.where(solved, answer.U, jnp.nan).reshape(shape)
+    assert problem.law is not None
 
-    def step(x: Any, u: Any) -> tuple[Any, tuple[Any, Any]]:
-        return plant.step(x, u), (x, plant.output(x))
+    def step(x: Any, now: tuple[Any, Any, Any, Any]) -> tuple[Any, tuple[Any, Any]]:
+        # With feedback: on an unstable plant the inputs alone would not lead where they should.
+        K, L, w, u = now
+        pulled = w @ L - x @ K.swapaxes(-1, -2)
+        return plant.step(x, jnp.clip(pulled, plant.u_min[:, None], plant.u_max[:, None])), (
+            x,
+            plant.output(x),
+        )
 
     start = jnp.where(solved, x0, jnp.nan)
-    last, (x, y) = jax.lax.scan(step, start, jnp.moveaxis(U, 2, 0))
+    along = (problem.law.K, problem.law.L, answer.w.reshape(shape), U)
+    steps = [jnp.moveaxis(a, i, 0) for a, i in zip(along, (1, 1, 2, 2), strict=True)]
+    last, (x, y) = jax.lax.scan(step, start, tuple(steps))
     X, Y = jnp.moveaxis(jnp.concatenate([x, last[None]]), 0, 2), jnp.moveaxis(y, 0, 2)
     plans = bypass_init(Trajectory, x=X, u=U, y=Y)
     cost, axis = many.own(many.costs)
@@ -227,12 +225,7 @@ class BatchedMPC(Controller):
         begin, lead = starts(x0, self.system.nx, self._many)
         parts = tuple(self._many)
         answer, plans, cost = jax.tree.map(
-            np.asarray,
-            without_haste(
-                self._many,
-                lambda thorough: _solve_many(parts, self.horizon, begin, self.tol, thorough),
-                lambda out: out[0].status,
-            ),
+            np.asarray, _solve_many(parts, self.horizon, begin, self.tol)
         )
         trajectory = jax.tree.map(lambda a: a.reshape(*lead, *a.shape[2:]), plans)
         status = STATUSES[answer.status].reshape(lead)

@@ -1,0 +1,223 @@
+"""Goldfarb and Idnani's dual active-set method for many least-distance problems side by side.
+
+min ½‖w‖² over l ≤ e + Y w ≤ u, rows of Y of unit length. Starts at w = 0 without any row, takes up
+the most violated row at a time, and lets go of those whose multipliers would change sign. Each
+step raises the minimum, so that none comes back; a row that cannot be met by moving w, nor by
+letting go of others, is the proof that there is no solution.
+
+Kept of the active rows C, in slots: C itself and its pseudo-inverse, N = (C Cᵀ)⁻¹C, which changes
+by a product of two vectors in each step. All steps of all problems are the same few products.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+ROOM = 1e-13
+"""Rows beyond their limits by less, relative to their size, are not violated."""
+
+DEPENDENT = 1e-10
+"""The part of a row that the active ones do not span has at least this length to count."""
+
+FAR = 1e7
+"""There is no solution if every one would have to lie so many times as far out as w is."""
+
+ROUNDS = 3
+"""How often multipliers are computed afresh, and the method goes on from there."""
+
+
+class Dual(NamedTuple):
+    """Multipliers (b, m); their softness, 1 over a bound on σ² (b,); verdicts; steps taken."""
+
+    multipliers: Any
+    softness: Any
+    infeasible: Any
+    limited: Any
+    count: Any
+
+
+class _State(NamedTuple):
+    w: Any
+    C: Any
+    """Active rows, with the sign that makes them upper limits (b, n, n); 0 in free slots."""
+    N: Any
+    target: Any
+    """What C w is at the limits (b, n)."""
+    force: Any
+    """Multipliers of the slots (b, n), none negative but those of equalities."""
+    row: Any
+    """Which row a slot holds (b, n); −1 if it is free."""
+    sign: Any
+    new: Any
+    """The row that is being taken up (b,); −1 between two."""
+    side: Any
+    push: Any
+    """Its multiplier so far (b,)."""
+    done: Any
+    infeasible: Any
+    stuck: Any
+    count: Any
+
+
+def _of(M: Any, v: Any) -> Any:
+    return jnp.einsum("bij,bj->bi", M, v)
+
+
+def _back(M: Any, v: Any) -> Any:
+    return jnp.einsum("bij,bi->bj", M, v)
+
+
+def _at(array: Any, index: Any) -> Any:
+    return jnp.take_along_axis(array, index[:, None], axis=1)[:, 0]
+
+
+def dual_method(Y: Any, mine: Any, free: Any, lower: Any, upper: Any, skip: Any) -> Dual:
+    """Solve b problems: Y (c, m, n), ``mine`` (b,) which of them, the rest (b, m).
+
+    Where ``skip`` (b,) nothing is done. Infinite limits are none.
+    """
+    b, m, n = len(mine), *Y.shape[1:]
+    limit = 20 * n + 200
+    if len(Y) == 1:
+
+        def rows_of(w: Any) -> Any:
+            return free + w @ Y[0].T
+
+        def row_of(p: Any) -> Any:
+            return Y[0][p]
+
+    else:
+        own = Y[mine]
+
+        def rows_of(w: Any) -> Any:
+            return free + _of(own, w)
+
+        def row_of(p: Any) -> Any:
+            return jnp.take_along_axis(own, p[:, None, None], axis=1)[:, 0]
+
+    equal = lower == upper
+    slots = jnp.arange(n)
+
+    def step(state: _State) -> _State:
+        s = state
+        # The row to take up: the one begun, or the most violated.
+        rows = rows_of(s.w)
+        over, under = rows - upper, lower - rows
+        size = jnp.abs(free) + jnp.linalg.norm(s.w, axis=-1)[:, None]
+        beyond = jnp.maximum(over, under)
+        worst = jnp.argmax(jnp.where(beyond > ROOM * size, beyond, 0.0), axis=-1)
+        fresh = s.new < 0
+        p = jnp.where(fresh, worst, s.new)
+        side = jnp.where(fresh, jnp.where(_at(over, p) >= _at(under, p), 1.0, -1.0), s.side)
+        push = jnp.where(fresh, 0.0, s.push)
+        violation = jnp.where(side > 0, _at(over, p), _at(under, p))
+        arrived = fresh & ~(violation > ROOM * _at(size, p))
+
+        # Moving by −z lowers it and keeps the active rows where they are.
+        normal = side[:, None] * row_of(p)
+        r = _of(s.N, normal)
+        z = normal - _back(s.C, r)
+        more = _of(s.N, z)
+        r, z = r + more, z - _back(s.C, more)
+        length = jnp.linalg.norm(z, axis=-1)
+        moves = length > DEPENDENT
+        full = jnp.where(moves, violation / jnp.where(moves, length, 1.0) ** 2, jnp.inf)
+        bound = (s.row >= 0) & ~jnp.take_along_axis(equal, s.row, axis=1) & (r > 1e-14)
+        room = jnp.where(bound, s.force / jnp.where(bound, r, 1.0), jnp.inf)
+        first = jnp.argmin(room, axis=-1)
+        t = jnp.minimum(full, _at(room, first))
+
+        nowhere = ~arrived & ~jnp.isfinite(t)
+        reach = violation / jnp.maximum(length, 1e-300)
+        proof = nowhere & (reach > FAR * jnp.linalg.norm(s.w, axis=-1)) & (reach > 0)
+        done = s.done | arrived | nowhere | ~jnp.isfinite(violation)
+        go = ~done
+        t = jnp.where(go, t, 0.0)
+        add = go & (full <= _at(room, first))
+        drop = go & ~add
+
+        w = s.w - (t * moves)[:, None] * z
+        force = jnp.maximum(s.force - t[:, None] * r, jnp.where(bound, 0.0, -jnp.inf))
+        push = push + t
+
+        # Taken up: a free slot gets the row. Let go: its slot becomes free.
+        empty = jnp.argmin(s.row >= 0, axis=-1)
+        place = slots == jnp.where(add, empty, first)[:, None]
+        add, drop = add[:, None], drop[:, None]
+        g = jnp.take_along_axis(s.N, first[:, None, None], axis=1)[:, 0]
+        by = jnp.where(add, z, g)
+        square = jnp.sum(by * by, axis=-1, keepdims=True)
+        square = jnp.where(square > 0, square, 1.0)
+        change = jnp.where(add, jnp.where(place, 1.0, -r), -_of(s.N, g)) / square
+        change = jnp.where(add | drop, change, 0.0)
+        N = s.N + change[:, :, None] * by[:, None, :]
+        gone, comes = (place & drop)[:, :, None], (place & add)[:, :, None]
+        N = jnp.where(gone, 0.0, N)
+        C = jnp.where(gone, 0.0, jnp.where(comes, normal[:, None, :], s.C))
+        limits = jnp.where(side > 0, _at(upper - free, p), _at(free - lower, p))
+
+        def put(old: Any, taken: Any, free_slot: Any) -> Any:
+            new = jnp.where(place & add, taken[:, None], old)
+            return jnp.where(place & drop, free_slot, new)
+
+        return _State(
+            w,
+            C,
+            N,
+            target=put(s.target, limits, 0.0),
+            force=put(force, push, 0.0),
+            row=put(s.row, p, -1),
+            sign=put(s.sign, side, 0.0),
+            new=jnp.where(drop[:, 0], p, -1),
+            side=side,
+            push=push,
+            done=done,
+            infeasible=s.infeasible | (proof & ~s.done),
+            stuck=s.stuck | (nowhere & ~proof & ~s.done),
+            count=s.count + go,
+        )
+
+    def afresh(s: _State) -> _State:
+        """Compute w and the multipliers from the active rows alone; let go of wrong signs."""
+        w = _back(s.N, s.target)
+        for _ in range(2):
+            w = w + _back(s.N, s.target - _of(s.C, w))
+        force = -_of(s.N, w)
+        for _ in range(2):
+            force = force - _of(s.N, w + _back(s.C, force))
+        return s._replace(w=w, force=force)
+
+    def round_of(carry: tuple[Any, _State]) -> tuple[Any, _State]:
+        k, state = carry
+
+        def unfinished(s: _State) -> Any:
+            return ~jnp.all(s.done) & (jnp.max(s.count) < limit)
+
+        state = afresh(jax.lax.while_loop(unfinished, step, state))
+        # Go on where what was computed afresh breaks a limit.
+        rows = rows_of(state.w)
+        size = jnp.abs(free) + jnp.linalg.norm(state.w, axis=-1)[:, None]
+        broken = (jnp.maximum(rows - upper, lower - rows) > 10 * ROOM * size).any(-1)
+        again = broken & ~skip & ~state.infeasible & ~state.stuck & (state.count < limit)
+        force = jnp.where(again[:, None], jnp.maximum(state.force, 0.0), state.force)
+        return k + 1, state._replace(done=~again, force=force, new=jnp.where(again, -1, state.new))
+
+    zero, none = jnp.zeros((b, n)), jnp.zeros((b, n, n))
+    nothing, no = jnp.full(b, -1), jnp.zeros(b, bool)
+    count = jnp.zeros(b, int)
+    start = _State(
+        zero, none, none, zero, zero, jnp.full((b, n), -1), zero,
+        nothing, jnp.ones(b), jnp.zeros(b), skip, no, no, count,
+    )  # fmt: skip
+    _, end = jax.lax.while_loop(
+        lambda carry: (carry[0] < ROUNDS) & ~jnp.all(carry[1].done), round_of, (0, start)
+    )
+    lanes = jnp.arange(b)[:, None]
+    place = jnp.where(end.row >= 0, end.row, m)
+    multipliers = jnp.zeros((b, m + 1)).at[lanes, place].add(end.sign * end.force)[:, :m]
+    softness = jnp.maximum(jnp.sum(end.N**2, axis=(1, 2)), 1.0)
+    limited = ~end.done | (end.count >= limit)
+    return Dual(multipliers, softness, end.infeasible, limited, end.count)
