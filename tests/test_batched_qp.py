@@ -86,7 +86,7 @@ def test_nothing_else_is_ever_called_solved():
     H, q, lower, upper, G, h = random_programs(64, 5, 20, np.random.default_rng(3))
     q[:8] = np.nan
     for thorough in (False, True):
-        found = answers(H, q, lower, upper, G, h, thorough)
+        found = answers(H, q, lower, upper, G, h)
         status = np.asarray(found.status)[:, 0]
         assert (status[:8] != SOLVED).all()
         for i in range(8, 64):

@@ -1,15 +1,14 @@
 """Many small quadratic programs side by side: c problems, each for k right-hand sides.
 
 min ½‖w‖² over l ≤ E x_0 + Y w ≤ u. Three methods, each for what the one before leaves over: w = 0,
-where it is feasible; a primal-dual active-set method, exact and short; Goldfarb and Idnani's dual
-method, which always arrives and tells what is infeasible.
+where it is feasible; with input bounds alone a primal-dual active-set method, exact and short;
+Goldfarb and Idnani's dual method, which always arrives and tells what is infeasible.
 
 The only unknowns are the multipliers λ of the rows: w = −Yᵀλ is optimal if the rows keep to their
 limits and only rows at their limits have multipliers, with the right sign.
 """
 
 from __future__ import annotations
-
 
 from typing import Any, NamedTuple
 
@@ -21,16 +20,17 @@ from prefmpc.mpc._condensed import CondensedProblem
 from prefmpc.mpc._dual_method import dual_method
 from prefmpc.mpc._limits import ON_LIMIT, row_sizes
 
-BOX_STEPS = 120
-STEPS = 15
-PATIENCE = 3
-"""With polyhedra, a step after so many that finishes no problem is the last."""
+STEPS = 120
+"""Active sets that are tried where there are input bounds alone."""
 
 TRIES = 3
 """Changes of the whole active set that may be in vain before single ones are made."""
 
-CHUNK = 2**19
-"""Numbers in the arrays that the dual method works on at a time."""
+LANES = 16
+"""Problems that the dual method takes at a time, if they are small."""
+
+CHUNK = 2**20
+"""Numbers in its arrays, at most."""
 
 ROUNDING = 1e-15
 FINEST = 1e-12
@@ -86,23 +86,23 @@ def solve(problem: CondensedProblem, x0: Any, tol: Any, *, start: Any = None) ->
     n = problem.Y.shape[-1]
     data, impossible = _data(problem, x0)
     dead = ~jnp.isfinite(data.free).all(-1) | impossible
-    found = _active_set(problem, data, start, dead, tol)
+    start = jnp.zeros_like(data.free) if start is None else start
+    none, one = jnp.zeros_like(data.free), jnp.ones(dead.shape)
+    found = _judged(data, none, data.free, one, n, jnp.zeros(dead.shape, dtype=int), tol)
+    if problem.fixed is None:
+        found = _active_set(problem, data, start, found, dead, tol)
     ended = jax.lax.cond(
         jnp.all(found.done | dead),
         lambda found: (found, dead & False, dead & False),
-        lambda found: _left_over(problem, data, found, dead, tol),
+        lambda found: _left_over(problem, data, start, found, dead, tol),
         found,
     )
     found, infeasible, limited = ended
     U = jnp.clip(found.rows, data.lower, data.upper)[..., :n] * problem.scale[:, None]
     w = -(found.multipliers @ problem.Y)
-    status = jnp.where(
-        found.done & jnp.isfinite(U).all(-1),
-        SOLVED,
-        jnp.where(
-            impossible | infeasible, INFEASIBLE, jnp.where(limited, UNFINISHED, FAILED)
-        ),
-    )
+    status = jnp.where(found.done & jnp.isfinite(U).all(-1), SOLVED, FAILED)
+    status = jnp.where(limited, UNFINISHED, status)
+    status = jnp.where(impossible | infeasible, INFEASIBLE, status)
     return Answer(U, w, found.multipliers, status, found.residual, found.iterations)
 
 
@@ -205,31 +205,27 @@ def _next_guess(guess: _Guess, high: Any, low: Any) -> _Guess:
     )
 
 
-def _active_set(problem: CondensedProblem, data: _Data, start: Any, dead: Any, tol: Any) -> _Search:
+def _active_set(
+    problem: CondensedProblem, data: _Data, start: Any, free: _Search, dead: Any, tol: Any
+) -> _Search:
     """Guess the active rows, solve for their multipliers, look which rows are active then.
 
     Hintermüller, Ito and Kunisch's primal-dual active-set method. Where the guess repeats itself
     it is exact. The first guess is what was active at ``start``, if anything was.
     """
     n = problem.Y.shape[-1]
-    none, count = jnp.zeros_like(data.free), jnp.zeros(dead.shape, dtype=int)
-    start = none if start is None else start
     least = NOTHING * jnp.abs(start).max(-1, keepdims=True)
     pushed, pulled = start > least, start < -least
     warm = jnp.any(pushed | pulled, axis=-1, keepdims=True)
-    box = problem.fixed is None
-    steps, patience = (BOX_STEPS, BOX_STEPS) if box else (STEPS, PATIENCE)
 
     def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        k, now, guess, idle, _, softness = carry
+        k, now, guess, idle, softness = carry
         high, low = _active(data, now.multipliers, now.rows)
         first = warm & (k == 0)
         high, low = jnp.where(first, pushed, high), jnp.where(first, pulled, low)
         last, guess = guess, _next_guess(guess, high, low)
-        # More active rows than inputs depend on each other: too hard a case for this method.
-        both = guess.high | guess.low
-        idle |= now.done | (jnp.sum(both, axis=-1) > n)
-        active = both & ~idle[..., None]
+        idle |= now.done
+        active = (guess.high | guess.low) & ~idle[..., None]
         # From where λ is: repeated with the same rows it removes rounding errors.
         kept = jnp.where(active, now.multipliers, 0.0)
         rows = data.free - _moved(problem, kept)
@@ -243,18 +239,13 @@ def _active_set(problem: CondensedProblem, data: _Data, start: Any, dead: Any, t
         rows -= _moved(problem, more)
         new = _judged(data, kept + more, rows, softness, n, now.iterations + 1, tol)
         new = _kept(idle, now, new)
-        return k + 1, new, guess, idle | new.done, jnp.all(new.done == now.done), softness
+        return k + 1, new, guess, idle | new.done, softness
 
-    def unfinished(carry: tuple[Any, ...]) -> Any:
-        k, _, _, idle, stuck, _ = carry
-        return (k < steps) & ~jnp.all(idle) & ~((k >= patience) & stuck)
-
-    one = jnp.ones(dead.shape)
-    free = _judged(data, none, data.free, one, n, count, tol)
     nowhere = jnp.zeros_like(data.free, dtype=bool)
-    guess = _Guess(nowhere, nowhere, jnp.full(dead.shape, none.shape[-1] + 1), count + TRIES)
-    begin = (0, free, guess, dead | free.done, False, one)
-    return jax.lax.while_loop(unfinished, step, begin)[1]
+    m = data.free.shape[-1]
+    guess = _Guess(nowhere, nowhere, jnp.full(dead.shape, m + 1), free.iterations + TRIES)
+    begin = (0, free, guess, dead | free.done, jnp.ones(dead.shape))
+    return jax.lax.while_loop(lambda carry: (carry[0] < STEPS) & ~jnp.all(carry[3]), step, begin)[1]
 
 
 def _kept(keep: Any, old: Any, new: Any) -> Any:
@@ -300,16 +291,17 @@ def _conjugate_gradients(
 
 
 def _left_over(
-    problem: CondensedProblem, data: _Data, found: _Search, dead: Any, tol: Any
+    problem: CondensedProblem, data: _Data, start: Any, found: _Search, dead: Any, tol: Any
 ) -> tuple[_Search, Any, Any]:
     """Solve what is left over by the dual method, gathered in front, chunk by chunk."""
     c, k = dead.shape
     m, n = problem.Y.shape[1:]
     lanes = c * k
-    chunk = max(1, min(CHUNK // (n * n + (m * n if c > 1 else m)), lanes, 64))
+    chunk = max(1, min(CHUNK // (n * n + (m * n if c > 1 else m)), lanes, LANES))
     one_row = jax.tree.map(lambda a: a.reshape(lanes, *a.shape[2:]), (data, found))
     finished = (found.done | dead).ravel()
-    order = jnp.argsort(finished)
+    # Together with their like: all problems of a chunk go on until the hardest is done.
+    order = jnp.argsort(jnp.where(finished, m + 1, jnp.sum(start != 0, axis=-1).ravel()))
     order = jnp.concatenate([order, order[:1].repeat(chunk)])
     left = jnp.sum(~finished)
 
@@ -333,8 +325,8 @@ def _left_over(
         return i + chunk, out, put(infeasible, said[0]), put(limited, said[1])
 
     no = jnp.zeros(lanes, dtype=bool)
-    start = 0, one_row[1], no, no
-    _, out, infeasible, limited = jax.lax.while_loop(lambda carry: carry[0] < left, work, start)
+    begin = 0, one_row[1], no, no
+    _, out, infeasible, limited = jax.lax.while_loop(lambda carry: carry[0] < left, work, begin)
     shaped = jax.tree.map(lambda a: a.reshape(c, k, *a.shape[1:]), out)
     return shaped, infeasible.reshape(c, k), limited.reshape(c, k)
 

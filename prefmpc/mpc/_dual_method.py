@@ -79,7 +79,7 @@ def dual_method(Y: Any, mine: Any, free: Any, lower: Any, upper: Any, skip: Any)
 
     Where ``skip`` (b,) nothing is done. Infinite limits are none.
     """
-    b, m, n = len(mine), *Y.shape[1:]
+    b, (m, n) = len(mine), Y.shape[1:]
     limit = 20 * n + 200
     if len(Y) == 1:
 

@@ -148,19 +148,16 @@ def _solve_many(
     U = jnp.where(solved, answer.U, jnp.nan).reshape(shape)
     assert problem.law is not None
 
-    def step(x: Any, now: tuple[Any, Any, Any, Any]) -> tuple[Any, tuple[Any, Any]]:
+    def step(x: Any, now: tuple[Any, Any, Any]) -> tuple[Any, tuple[Any, Any]]:
         # With feedback: on an unstable plant the inputs alone would not lead where they should.
-        K, L, w, u = now
-        pulled = w @ L - x @ K.swapaxes(-1, -2)
-        return plant.step(x, jnp.clip(pulled, plant.u_min[:, None], plant.u_max[:, None])), (
-            x,
-            plant.output(x),
-        )
+        K, L, w = now
+        u = jnp.clip(w @ L - x @ K.swapaxes(1, 2), plant.u_min[:, None], plant.u_max[:, None])
+        return plant.step(x, u), (x, plant.output(x))
 
     start = jnp.where(solved, x0, jnp.nan)
-    along = (problem.law.K, problem.law.L, answer.w.reshape(shape), U)
-    steps = [jnp.moveaxis(a, i, 0) for a, i in zip(along, (1, 1, 2, 2), strict=True)]
-    last, (x, y) = jax.lax.scan(step, start, tuple(steps))
+    K, L = (jnp.moveaxis(a, 1, 0) for a in problem.law)
+    w = jnp.moveaxis(answer.w.reshape(shape), 2, 0)
+    last, (x, y) = jax.lax.scan(step, start, (K, L, w))
     X, Y = jnp.moveaxis(jnp.concatenate([x, last[None]]), 0, 2), jnp.moveaxis(y, 0, 2)
     plans = bypass_init(Trajectory, x=X, u=U, y=Y)
     cost, axis = many.own(many.costs)

@@ -14,7 +14,6 @@ from prefmpc.convex import fit_map
 from prefmpc.evaluation import accuracy, simulate
 from prefmpc.models import QuadraticCost, SumCost
 from prefmpc.mpc import ConvexMPC
-from prefmpc.mpc._condensed import responses
 from prefmpc.networks import ICNNCost
 from prefmpc.pools import lqr_pool, random_states
 from prefmpc.preferences import by_criterion
@@ -114,10 +113,19 @@ def fit_offset(data: Comparisons) -> QuadraticCost:
     return fit_map(extended(data), bryson(np.append(REACH, 0.3), FORCES)).model
 
 
+def responses(system: LinearSystem, horizon: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return Φ (N, nx, nx) and Γ (N, nx, N·nu): x_k = Φ_k x_0 + Γ_k U."""
+    Phi = np.stack([np.linalg.matrix_power(system.A, k) for k in range(horizon)])
+    Gamma = np.zeros((horizon, system.nx, horizon, system.nu))
+    for k in range(1, horizon):
+        Gamma[k, :, :k] = np.swapaxes(Phi[k - 1 :: -1] @ system.B, 0, 1)
+    return Phi, Gamma.reshape(horizon, system.nx, -1)
+
+
 def person_loops(system: LinearSystem, x0: np.ndarray, steps: int) -> Trajectory:
     """Run the MPC that minimises `one_sided` itself: what the best learner could do."""
     N = QUADRATIC_HORIZON
-    Phi, Gamma = (np.asarray(part)[:-1] for part in responses(system, N))
+    Phi, Gamma = responses(system, N)
     Phi, Gamma = Phi[:, :3], Gamma[:, :3].reshape(3 * N, -1)
     L = 2 * WALL_SIDE * np.linalg.norm(Gamma, 2) ** 2 + 2 * EFFORT
     low, high = np.tile(system.u_min, N), np.tile(system.u_max, N)

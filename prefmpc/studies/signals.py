@@ -15,12 +15,12 @@ from prefmpc.convex import fit_map
 from prefmpc.evaluation import accuracy
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc._batched_qp import SOLVED, solve
-from prefmpc.mpc._condensed import CondensedProblem, responses, scaled
+from prefmpc.mpc._condensed import CondensedProblem, scaled
 from prefmpc.pools import random_states, random_weights
 from prefmpc.preferences import by_criterion
 from prefmpc.priors import WishartPrior, bryson
 from prefmpc.signals import Signal, SignalCost, select
-from prefmpc.studies.onesided import FORCES, REACH
+from prefmpc.studies.onesided import FORCES, REACH, responses
 from prefmpc.studies.quadratic import (
     QUADRATIC_HORIZON,
     QUADRATIC_Q,
@@ -73,7 +73,7 @@ JERK = 20.0
 JERK_SIZES = (100, 1000, 4000)
 JERK_LEARNERS = ("(X, U)", "(X, ΔU, U)")
 PRECISION = 1e-6
-"""N: proven distance of an input from the optimum that counts as solved."""
+"""Error of a plan, relative to its largest input, that counts as solved."""
 
 
 def trajectory_rows(
@@ -84,7 +84,7 @@ def trajectory_rows(
     For "x", "y", "du" and "dy", in the order of `prefmpc.select`.
     """
     nx, nu = system.nx, system.nu
-    Phi, Gamma = (np.asarray(part)[:-1] for part in responses(system, horizon))
+    Phi, Gamma = responses(system, horizon)
     X = np.concatenate([Phi, np.zeros((horizon, nx, nu)), Gamma], axis=2)
     U = np.eye(nu + horizon * nu).reshape(horizon + 1, nu, -1)
     U = np.concatenate([np.zeros((horizon + 1, nu, nx)), U], axis=2)
