@@ -1,0 +1,157 @@
+"""Random MPC problems, on stable and unstable plants, with an oracle that keeps the states.
+
+Clarabel solves the sparse form, in which nothing grows with the horizon; a factorisation of the
+optimality conditions with the rows that it found active then gives the digits that it leaves out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import clarabel
+import numpy as np
+import scipy.sparse as sp
+import scipy.sparse.linalg
+
+from prefmpc import BatchedMPC, LinearSystem, Polyhedron, QuadraticCost
+
+KINDS = ("bounds", "coupled", "terminal")
+SHAPES = (
+    (2, 1, 5), (2, 1, 20), (2, 1, 100), (2, 2, 40), (3, 1, 10), (3, 1, 60), (3, 2, 30), (4, 1, 100),
+    (4, 2, 10), (4, 2, 50), (4, 3, 20), (5, 1, 30), (5, 2, 80), (6, 1, 15), (6, 2, 100), (6, 3, 10),
+    (7, 2, 25), (8, 1, 50), (8, 2, 5), (8, 3, 15), (8, 3, 60),
+)  # fmt: skip
+
+
+@dataclasses.dataclass(frozen=True)
+class Problems:
+    """``plants`` plants of one size, and as many states for each: x0 (plants, states, nx)."""
+
+    systems: list
+    Q: np.ndarray
+    R: np.ndarray
+    horizon: int
+    constraints: Polyhedron | None
+    terminal: Polyhedron | None
+    x0: np.ndarray
+
+    def ours(self):
+        """Return the solution of all by `BatchedMPC`."""
+        return BatchedMPC(
+            LinearSystem.stack(self.systems),
+            QuadraticCost(self.Q, self.R),
+            self.horizon,
+            constraints=self.constraints,
+            terminal=self.terminal,
+        ).solve(self.x0)
+
+
+def random_problems(shape, kind, plants, states, rng):
+    """Draw spectral radii from 0.5 to 2, weights over two decades, states over four."""
+    nx, nu, N = shape
+    systems, Q, R = [], [], []
+    for _ in range(plants):
+        A = rng.normal(size=(nx, nx))
+        A *= rng.uniform(0.5, 2.0) / np.abs(np.linalg.eigvals(A)).max()
+        B = rng.normal(size=(nx, nu))
+        systems.append(LinearSystem(A, B, dt=0.1, u_min=-1, u_max=rng.uniform(0.5, 1.5, nu)))
+        L, M = rng.normal(size=(nx, nx)), rng.normal(size=(nu, nu))
+        Q.append(L @ L.T / nx + 10 ** rng.uniform(-2, 0) * np.eye(nx))
+        R.append((M @ M.T + np.eye(nu)) * 10 ** rng.uniform(-2, 0.5))
+    constraints = terminal = None
+    if kind == "coupled":
+        constraints = Polyhedron(rng.normal(size=(4, nx + nu)), rng.uniform(0.2, 1.5, 4))
+    if kind == "terminal":
+        terminal = Polyhedron.box([-0.3] * nx, [0.3] * nx)
+    x0 = rng.normal(size=(plants, states, nx)) * 10 ** rng.uniform(-3, 0.5, (plants, states, 1))
+    return Problems(systems, np.array(Q), np.array(R), N, constraints, terminal, x0)
+
+
+class Oracle:
+    """The problem of one plant, for one state after another."""
+
+    def __init__(self, problems, i):
+        system, N = problems.systems[i], problems.horizon
+        nx, nu = system.nx, system.nu
+        self.split = nx * (N + 1)
+        weights = [sp.kron(sp.eye(N), 2 * problems.Q[i]), sp.csc_matrix((nx, nx))]
+        weights.append(sp.kron(sp.eye(N), 2 * problems.R[i]))
+        self.P = sp.block_diag(weights, format="csc")
+        now = sp.hstack([sp.eye(N), sp.csc_matrix((N, 1))])
+        A = sp.kron(sp.eye(N + 1, k=-1), system.A) - sp.eye(self.split)
+        B = sp.vstack([sp.csc_matrix((nx, N * nu)), sp.kron(sp.eye(N), system.B)])
+        self.dynamics = sp.hstack([A, B], format="csc")
+        box = sp.hstack([sp.csc_matrix((N * nu, self.split)), sp.eye(N * nu)])
+        rows, h = [box, -box], [np.tile(system.u_max, N), np.tile(-system.u_min, N)]
+        if (Z := problems.constraints) is not None:
+            parts = sp.kron(now, Z.H[:, :nx]), sp.kron(sp.eye(N), Z.H[:, nx:])
+            rows.append(sp.hstack(parts))
+            h.append(np.tile(Z.h, N))
+        if (end := problems.terminal) is not None:
+            last = sp.kron(sp.csc_matrix(np.eye(N + 1)[-1:]), end.H)
+            rows.append(sp.hstack([last, sp.csc_matrix((len(end.h), N * nu))]))
+            h.append(end.h)
+        self.G, self.h = sp.vstack(rows, format="csc"), np.concatenate(h)
+        self.nothing = np.zeros(self.P.shape[0])
+
+    def __call__(self, x0):
+        """Return the status and the inputs (N·nu,)."""
+        start = np.zeros(self.split)
+        start[: len(x0)] = -x0
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        cones = [clarabel.ZeroConeT(len(start)), clarabel.NonnegativeConeT(len(self.h))]
+        rows = sp.vstack([self.dynamics, self.G], format="csc")
+        b = np.concatenate([start, self.h])
+        found = clarabel.DefaultSolver(self.P, self.nothing, rows, b, cones, settings).solve()
+        status = {"Solved": "solved", "PrimalInfeasible": "infeasible"}.get(
+            str(found.status), "unfinished"
+        )
+        if status != "solved":
+            return status, None
+        z, multipliers = np.array(found.x), np.array(found.z)[len(start) :]
+        better = self._polished(start, multipliers > np.array(found.s)[len(start) :])
+        return status, (z if better is None else better)[self.split :]
+
+    def _polished(self, start, active):
+        """Return the optimum with these rows active, None if it is none."""
+        held = sp.vstack([self.dynamics, self.G[active]], format="csc")
+        limits = np.concatenate([start, self.h[active]])
+        n, m = self.P.shape[0], len(limits)
+        matrix = sp.bmat([[self.P, held.T], [held, None]], format="csc")
+        soft = sp.block_diag([1e-9 * sp.eye(n), -1e-9 * sp.eye(m)], format="csc")
+        right = np.concatenate([self.nothing, limits])
+        try:
+            factors = scipy.sparse.linalg.splu(matrix + soft)
+        except RuntimeError:
+            return None
+        z = np.zeros(n + m)
+        for _ in range(30):
+            z += factors.solve(right - matrix @ z)
+        miss = np.abs(right - matrix @ z).max() / (1 + np.abs(right).max())
+        beyond = (self.G @ z[:n] - self.h).max(initial=0)
+        pulls = z[n + self.split :].min(initial=0)
+        size = 1 + np.abs(z[n:]).max()
+        good = miss < 1e-10 and beyond < 1e-9 and pulls > -1e-8 * size
+        return z[:n] if good else None
+
+
+def compared(problems):
+    """Return the verdicts of both (ours, the oracle's) and the largest difference of inputs.
+
+    Relative to max(1, |u|), over all problems that both solve; and what is wrong with ours.
+    """
+    answer = problems.ours()
+    verdicts, apart = [], 0.0
+    U = answer.trajectory.u.reshape(*answer.status.shape, -1)
+    for i in range(len(problems.systems)):
+        oracle = Oracle(problems, i)
+        for k, x0 in enumerate(problems.x0[i]):
+            status, inputs = oracle(x0)
+            verdicts.append((str(answer.status[i, k]), status))
+            if verdicts[-1] == ("solved", "solved"):
+                size = max(1.0, np.abs(inputs).max())
+                apart = max(apart, np.abs(U[i, k] - inputs).max() / size)
+    solved = answer.status == "solved"
+    sound = np.isfinite(U[solved]).all() and (answer.residual[solved] <= 1e-8).all()
+    return verdicts, apart, bool(sound)
