@@ -173,7 +173,7 @@ def test_a_new_file_has_ordinary_permissions_without_touching_the_umask(tmp_path
     assert modes == {0o640}
 
 
-@pytest.mark.skipif(getattr(os, "geteuid", lambda: 1)() != 0, reason="only root can give files away")
+@pytest.mark.skipif(getattr(os, "geteuid", lambda: 1)() != 0, reason="only root gives files away")
 def test_a_replaced_file_keeps_its_owner(path):
     os.chown(path, 12345, 12346)
     save(path)

@@ -320,7 +320,7 @@ def test_states_are_repeated_in_a_row():
 
 
 def test_an_unsure_person_errs_as_often_as_asked():
-    pool = lqr_pool(oscillating_masses(), 20, 10, key=KEY, radius=RADIUS)
+    pool = lqr_pool(oscillating_masses(), 20, 10, key=KEY, radius=RADIUS, saturate=False)
     cost = phi(pool, QUADRATIC_Q, QUADRATIC_R)
     i, j = np.triu_indices(20, 1)
     for error in (0.02, 0.1):
