@@ -53,7 +53,7 @@ print(json.dumps(learning.with_memory(int(sys.argv[1]), 7)))
 def pool_of(size: int, horizon: int = 10) -> prefmpc.Trajectory:
     """Return trajectories to compare."""
     system, key = prefmpc.oscillating_masses(), jax.random.key(0)
-    return prefmpc.lqr_pool(system, size, horizon, key=key, radius=studies.RADIUS)
+    return prefmpc.lqr_pool(system, size, horizon, key=key, radius=studies.RADIUS, saturate=False)
 
 
 def data_of(pool: prefmpc.Trajectory, n: int) -> prefmpc.Comparisons:

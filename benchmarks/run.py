@@ -22,6 +22,8 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import jax
 from measure import machine
 
+from prefmpc._files import atomic_write
+
 PARTS = ("loops", "constrained", "learning", "tables", "growth", "limit", "solvers", "nonlinear")
 
 
@@ -43,7 +45,9 @@ def main() -> None:
         results[name] = importlib.import_module(name).run(mini=options.mini)
         results["seconds"][name] = round(time.perf_counter() - began, 1)
         print(f"\n({name}: {results['seconds'][name]:.0f} s)", flush=True)
-    options.out.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
+    text = json.dumps(results, indent=1, ensure_ascii=False) + "\n"
+    with atomic_write(options.out, overwrite=True) as file:
+        file.write(text.encode())
     print(f"\nwritten: {options.out}")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from prefmpc._checks import finite_array, positive_int
+from prefmpc._files import atomic_write
 from prefmpc._random import generator
 from prefmpc.preferences import Preference
 from prefmpc.trajectories import Trajectory
@@ -178,28 +178,24 @@ class Comparisons:
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Write everything to one ``.npz`` file; an interrupted write leaves an old file whole.
 
-        Raises a FileExistsError if ``path`` exists and ``overwrite`` is False, and a ValueError
-        if it does not end in ``.npz``.
+        A file that is replaced keeps its permissions, and a symbolic link is followed. What a
+        killed process left behind is removed by the next `save` to the same file.
+
+        Raises
+        ------
+        FileExistsError
+            If ``path`` exists and ``overwrite`` is False. Of several processes that save to one
+            new path at once, one succeeds.
+        ValueError
+            If ``path`` does not end in ``.npz``.
+        OSError
+            If the file cannot be written.
         """
         target = Path(path)
         if target.suffix != ".npz":
             raise ValueError(f"path must end in .npz, got {str(path)!r}")
-        if target.exists() and not overwrite:
-            raise FileExistsError(f"{target} exists; pass overwrite=True to replace it")
-        handle, temporary = tempfile.mkstemp(dir=target.parent, suffix=".npz.part")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez_compressed(file, **self._stored())
-                file.flush()
-                os.fsync(file.fileno())
-            # mkstemp makes the file private; a data set gets the permissions of any new file.
-            mask = os.umask(0)
-            os.umask(mask)
-            os.chmod(temporary, 0o666 & ~mask)
-            os.replace(temporary, target)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        with atomic_write(target, overwrite=overwrite) as file:
+            np.savez_compressed(file, **self._stored())
         return target
 
     def _stored(self) -> dict[str, Any]:

@@ -172,7 +172,8 @@ def simulate(
     Parameters
     ----------
     controller : callable
-        x (nx,) → u (nu,): an MPC object, or any Python function.
+        x (nx,) → u (nu,): an MPC object, or any Python function. Input limits are its own affair:
+        the plant gets what it returns.
     x0 : array (nx,) or (m, nx)
         Batches run one after another; `closed_loops` is the fast way for many MPC loops.
     steps : int

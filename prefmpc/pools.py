@@ -61,10 +61,12 @@ def lqr_pool(
     radius: ArrayLike | None = None,
     x0: ArrayLike | None = None,
     weights: tuple[ArrayLike, ArrayLike] | None = None,
+    saturate: bool = True,
 ) -> Trajectory:
     """Simulate ``size`` closed loops, each with its own random x(0) and its own random LQR.
 
-    This is how the paper (section III-A) makes the trajectories that people compare.
+    This is how the paper (section III-A) makes the trajectories that people compare, but for one
+    thing: the inputs keep the limits of ``system`` unless ``saturate`` is False.
 
     Parameters
     ----------
@@ -75,6 +77,10 @@ def lqr_pool(
         compare trajectories with the same x(0).
     weights : (Q, R), optional
         Stacks (size, nx, nx) and (size, nu, nu) of LQR weights; default: `random_weights`.
+    saturate : bool
+        Apply u = clip(−K x, u_min, u_max), so that people compare what the plant can do. From a
+        far x(0) an unstable plant may then escape. False: u = −K x beyond the limits too; the
+        paper mentions no limits here, and its results are reproduced without.
 
     Returns
     -------
@@ -100,4 +106,4 @@ def lqr_pool(
         if starts.shape != (size, system.nx):
             raise ValueError(f"x0 must have shape {(size, system.nx)}, got {starts.shape}")
     gains = np.stack([system.lqr(q, r)[0] for q, r in zip(Q, R, strict=True)])
-    return rollout(system, starts, gains, steps)
+    return rollout(system, starts, gains, steps, saturate=saturate)

@@ -224,10 +224,13 @@ def rollout(
     x0: ArrayLike,
     law: Callable[[Any], Any] | ArrayLike,
     steps: int,
+    *,
+    saturate: bool = False,
 ) -> Trajectory:
     """Run the plant for ``steps`` steps under a feedback law, for a whole batch of x(0) at once.
 
-    The input bounds of ``system`` are not applied: a law that must respect them does so itself.
+    The input limits of ``system`` are not applied unless ``saturate`` is set: a law that must
+    respect them does so itself.
 
     Parameters
     ----------
@@ -236,6 +239,8 @@ def rollout(
         A JAX function x (nx,) → u (nu,), or a gain K for u = −K x, one for all or one for each
         x(0).
     steps : int
+    saturate : bool
+        Apply what the plant can give of the law's u: clip(u, u_min, u_max).
 
     Returns
     -------
@@ -254,13 +259,14 @@ def rollout(
     batch = starts.shape[:-1]
     flat = starts.reshape(-1, system.nx)
     if callable(law):
-        x, u = _rollout_law(system, flat, steps, law)
+        x, u = _rollout_law(system, flat, steps, law, bool(saturate))
     else:
         K = shaped("law", finite_array("law", law), (system.nu, system.nx), "a gain K")
         if K.shape[:-2] not in ((), batch):
             raise ValueError(f"law must hold one gain or one for each x0 {batch}, got {K.shape}")
         gains = array_module(K).broadcast_to(K, (*batch, system.nu, system.nx))
-        x, u = _rollout_gain(system, flat, steps, gains.reshape(-1, system.nu, system.nx))
+        gains = gains.reshape(-1, system.nu, system.nx)
+        x, u = _rollout_gain(system, flat, steps, gains, bool(saturate))
     x, u = to_numpy((x, u))
     if not isinstance(system, LinearSystem) and not is_traced(x):
         check_finite_states(x)
@@ -287,11 +293,15 @@ def from_flat(system: System, x: Any, u: Any, batch: tuple[int, ...]) -> Traject
     return bypass_init(Trajectory, x=x, u=u, y=system.output(x[..., :-1, :]))
 
 
-def _scan(system: System, x0: Any, steps: int, law: Callable[[Any], Any]) -> tuple[Any, Any]:
+def _scan(
+    system: System, x0: Any, steps: int, law: Callable[[Any], Any], saturate: bool
+) -> tuple[Any, Any]:
     def step(x: Any, _: None) -> tuple[Any, tuple[Any, Any]]:
         u = law(x)
         if jnp.shape(u) != (system.nu,):
             raise ValueError(f"law must return shape ({system.nu},), got {jnp.shape(u)}")
+        if saturate:
+            u = jnp.clip(u, system.u_min, system.u_max)
         x_next = system.step(x, u)
         return x_next, (x_next, u)
 
@@ -299,11 +309,15 @@ def _scan(system: System, x0: Any, steps: int, law: Callable[[Any], Any]) -> tup
     return jnp.concatenate([x0[None], x]), u
 
 
-@jax.jit(static_argnums=(2, 3))
-def _rollout_law(system: System, x0: Any, steps: int, law: Callable[[Any], Any]) -> Any:
-    return jax.vmap(lambda start: _scan(system, start, steps, law))(x0)
+@jax.jit(static_argnums=(2, 3, 4))
+def _rollout_law(
+    system: System, x0: Any, steps: int, law: Callable[[Any], Any], saturate: bool
+) -> Any:
+    return jax.vmap(lambda start: _scan(system, start, steps, law, saturate))(x0)
 
 
-@jax.jit(static_argnums=2)
-def _rollout_gain(system: System, x0: Any, steps: int, K: Any) -> Any:
-    return jax.vmap(lambda start, gain: _scan(system, start, steps, lambda x: -gain @ x))(x0, K)
+@jax.jit(static_argnums=(2, 4))
+def _rollout_gain(system: System, x0: Any, steps: int, K: Any, saturate: bool) -> Any:
+    return jax.vmap(lambda start, gain: _scan(system, start, steps, lambda x: -gain @ x, saturate))(
+        x0, K
+    )

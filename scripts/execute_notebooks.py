@@ -21,6 +21,11 @@ from nbclient import NotebookClient
 from nbclient.exceptions import CellControlSignal, DeadKernelError
 from nbformat import NotebookNode
 
+# One module of the library without the rest: JAX takes a second, and does not like the forks below.
+sys.path.append(str(Path(__file__).resolve().parents[1] / "prefmpc"))
+
+from _files import atomic_write
+
 ROOT = Path(__file__).resolve().parent.parent
 BOOK = ROOT / "book"
 
@@ -99,12 +104,8 @@ def execute(path: Path, timeout: int) -> str | None:
         return str(error)
     clean(notebook)
     nbformat.validate(notebook)
-    part = path.with_suffix(".ipynb.part")
-    try:
-        part.write_text(nbformat.writes(notebook).rstrip("\n") + "\n", encoding="utf-8")
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    with atomic_write(path, overwrite=True) as file:
+        file.write((nbformat.writes(notebook).rstrip("\n") + "\n").encode())
     return None
 
 

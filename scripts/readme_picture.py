@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import base64
 import json
-import os
+import sys
 from pathlib import Path
+
+# One module of the library without the rest: JAX takes a second.
+sys.path.append(str(Path(__file__).resolve().parents[1] / "prefmpc"))
+
+from _files import atomic_write
 
 ROOT = Path(__file__).resolve().parent.parent
 
@@ -19,10 +24,8 @@ def main() -> None:
         for output in cell.get("outputs", [])
         if "image/png" in output.get("data", {})
     ]
-    target = ROOT / "book/_static/readme.png"
-    temporary = target.with_suffix(".part")
-    temporary.write_bytes(base64.b64decode("".join(pictures[-1])))
-    os.replace(temporary, target)
+    with atomic_write(ROOT / "book/_static/readme.png", overwrite=True) as file:
+        file.write(base64.b64decode("".join(pictures[-1])))
 
 
 if __name__ == "__main__":

@@ -207,6 +207,17 @@ def test_an_interrupted_write_leaves_the_old_file_whole(tmp_path, monkeypatch, s
     assert list(tmp_path.iterdir()) == [path]
 
 
+def test_a_private_file_behind_a_link_stays_both(tmp_path, some):
+    path = some.save(tmp_path / "data.npz")
+    path.chmod(0o600)
+    link = tmp_path / "link.npz"
+    link.symlink_to(path)
+    assert some.subset([1]).save(link, overwrite=True) == link
+    assert link.is_symlink()
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert_same(Comparisons.load(path), some.subset([1]))
+
+
 def test_a_saved_file_has_ordinary_permissions(tmp_path, some):
     path = some.save(tmp_path / "data.npz")
     plain = tmp_path / "plain"

@@ -30,7 +30,9 @@ from prefmpc import (
 )
 from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
-POOL = lqr_pool(oscillating_masses(), 30, 10, key=jax.random.key(2000), radius=RADIUS)
+POOL = lqr_pool(
+    oscillating_masses(), 30, 10, key=jax.random.key(2000), radius=RADIUS, saturate=False
+)
 PERSON = QuadraticPreference(QUADRATIC_Q, QUADRATIC_R)
 CLEAN = Comparisons.random(POOL, PERSON, 50, key=jax.random.key(2001))
 NOISY = Comparisons.random(POOL, erring(PERSON, 0.2), 50, key=jax.random.key(2002))  # soft labels

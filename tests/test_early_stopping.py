@@ -23,8 +23,8 @@ from prefmpc.studies import RADIUS
 
 KEY = jax.random.key(3000)
 MASSES = oscillating_masses()
-POOL = lqr_pool(MASSES, 60, 10, key=jax.random.key(3001), radius=RADIUS)
-FRESH = lqr_pool(MASSES, 60, 10, key=jax.random.key(3002), radius=RADIUS)
+POOL = lqr_pool(MASSES, 60, 10, key=jax.random.key(3001), radius=RADIUS, saturate=False)
+FRESH = lqr_pool(MASSES, 60, 10, key=jax.random.key(3002), radius=RADIUS, saturate=False)
 SCALE = np.concatenate([np.abs(POOL.x).max((0, 1)), [1, 1]])
 TASTE = MLPCost.random(SCALE / 3, key=jax.random.key(3003), widths=(6,))
 QUADRATIC = QuadraticCost(np.diag(1 / SCALE[:6] ** 2), np.eye(2))

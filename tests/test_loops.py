@@ -201,7 +201,7 @@ for costs, states, options in cases:
     np.testing.assert_array_equal(alone.codes, shared.codes)
 assert COUNT == 2 or not alone.solved.all()
 
-pool = p.lqr_pool(system, 40, 10, key=jax.random.key(0), radius=RADIUS)
+pool = p.lqr_pool(system, 40, 10, key=jax.random.key(0), radius=RADIUS, saturate=False)
 person = p.QuadraticPreference(QUADRATIC_Q, QUADRATIC_R)
 data = p.Comparisons.random(pool, person, 6000, key=jax.random.key(1))
 prior = p.bryson(RADIUS, [1, 1])

@@ -31,7 +31,9 @@ from prefmpc.studies import RADIUS
 RNG = np.random.default_rng(0)
 SCALE = np.array([2.0, 0.5, 1.0])  # two states, one input
 T = Trajectory(RNG.normal(size=(5, 4, 2)), RNG.normal(size=(5, 3, 1)))
-POOL = lqr_pool(oscillating_masses(), 40, 10, key=jax.random.key(2500), radius=RADIUS)
+POOL = lqr_pool(
+    oscillating_masses(), 40, 10, key=jax.random.key(2500), radius=RADIUS, saturate=False
+)
 
 
 def by_hand(model, x, u):
@@ -125,7 +127,9 @@ def test_training_keeps_it_convex_and_learns_what_a_quadratic_cannot():
 
     person = by_criterion(overshoot)
     data = Comparisons.random(POOL, person, 150, key=jax.random.key(2501))
-    fresh = lqr_pool(oscillating_masses(), 40, 10, key=jax.random.key(2502), radius=RADIUS)
+    fresh = lqr_pool(
+        oscillating_masses(), 40, 10, key=jax.random.key(2502), radius=RADIUS, saturate=False
+    )
     test = Comparisons.random(fresh, person, 300, key=jax.random.key(2503))
     scale = np.concatenate([np.abs(POOL.x).max((0, 1)), [1, 1]])
     kind = {"activation": "squared_relu", "bias": False}

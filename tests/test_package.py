@@ -108,6 +108,7 @@ def test_everything_public_has_a_docstring(name):
 HELPERS = {"_checks", "_pytree", "_random"}
 LAYERS = {
     "_checks": set(),
+    "_files": set(),
     "_pytree": set(),
     "_random": {"_checks"},
     "_lbfgsb": set(),
@@ -116,7 +117,7 @@ LAYERS = {
     "trajectories": HELPERS | {"systems"},
     "pools": HELPERS | {"systems", "trajectories"},
     "preferences": HELPERS | {"trajectories"},
-    "comparisons": HELPERS | {"trajectories", "preferences"},
+    "comparisons": HELPERS | {"_files", "trajectories", "preferences"},
     "models": HELPERS | {"systems", "sets", "trajectories", "pools"},
     "losses": HELPERS | {"trajectories", "comparisons"},
     "training": HELPERS | {"_lbfgsb", "trajectories", "models", "comparisons", "losses"},
@@ -156,6 +157,7 @@ LAYERS = {
     },
     "studies": {
         *HELPERS,
+        "_files",
         *("systems", "sets", "trajectories", "pools", "preferences", "comparisons", "models"),
         *(
             "networks",

@@ -6,14 +6,14 @@ import jax
 import numpy as np
 import pytest
 
-from prefmpc import lqr_pool, oscillating_masses, random_states, random_weights
+from prefmpc import LinearSystem, lqr_pool, oscillating_masses, random_states, random_weights
 
 KEY = jax.random.key(2000)
 
 
 def test_a_pool_is_made_of_lqr_loops_from_random_states(masses):
     radius = np.array([0.3, 0.3, 0.3, 0.05, 0.05, 0.05])
-    pool = lqr_pool(masses, 8, 10, key=KEY, radius=radius)
+    pool = lqr_pool(masses, 8, 10, key=KEY, radius=radius, saturate=False)
     assert pool.x.shape == (8, 11, 6)
     x, u = np.asarray(pool.x), np.asarray(pool.u)
     moved = x[:, :-1] @ masses.A.T + u @ masses.B.T
@@ -24,16 +24,48 @@ def test_a_pool_is_made_of_lqr_loops_from_random_states(masses):
     for i, (K, *_) in enumerate(gains):
         np.testing.assert_allclose(x[i, :-1] @ K, u[i], atol=1e-10)
     assert np.abs(gains[0][0] - gains[1][0]).max() > 1e-3
-    again = lqr_pool(masses, 8, 10, key=KEY, radius=radius)
+    again = lqr_pool(masses, 8, 10, key=KEY, radius=radius, saturate=False)
     np.testing.assert_array_equal(again.x, pool.x)
 
 
 def test_a_pool_uses_the_weights_that_it_is_given(masses):
     Q, R = np.diag([40.0, 40, 40, 5, 5, 5]), 0.2 * np.eye(2)
     weights = np.stack([Q] * 3), np.stack([R] * 3)
-    pool = lqr_pool(masses, 3, 5, key=KEY, radius=np.ones(6), weights=weights)
+    pool = lqr_pool(masses, 3, 5, key=KEY, radius=np.ones(6), weights=weights, saturate=False)
     K = masses.lqr(Q, R)[0]
     np.testing.assert_allclose(pool.u, -pool.x[:, :-1] @ K.T, atol=1e-12)
+
+
+def test_a_pool_keeps_the_input_limits_unless_told_otherwise(masses):
+    radius = 3 * np.array([0.3, 0.3, 0.3, 0.05, 0.05, 0.05])
+    limited = LinearSystem(
+        masses.A, masses.B, masses.C, dt=masses.dt, u_min=[-0.5, -np.inf], u_max=[np.inf, 0.8]
+    )
+    weights = random_weights(6, 2, key=KEY, shape=(20,))
+    start = {"key": KEY, "radius": radius, "weights": weights}
+    pool, free = (lqr_pool(limited, 20, 12, **start, saturate=which) for which in (True, False))
+    default = lqr_pool(limited, 20, 12, **start)
+    np.testing.assert_array_equal(default.x, pool.x)
+    K = np.stack([limited.lqr(q, r)[0] for q, r in zip(*weights, strict=True)])
+    for T, low, high in ((pool, limited.u_min, limited.u_max), (free, -np.inf, np.inf)):
+        x = T.x[:, 0]
+        for k in range(12):  # by hand
+            u = np.clip(-np.einsum("iuk,ik->iu", K, x), low, high)
+            np.testing.assert_allclose(T.u[:, k], u, atol=1e-12)
+            x = x @ limited.A.T + u @ limited.B.T
+            np.testing.assert_allclose(T.x[:, k + 1], x, atol=1e-12)
+    assert pool.u[..., 0].min() == -0.5
+    assert pool.u[..., 1].max() == 0.8
+    assert free.u[..., 0].min() < -0.6 < 0.6 < pool.u[..., 0].max()  # that bound is infinite
+    assert free.u[..., 1].max() > 0.9
+
+
+def test_a_plant_without_limits_has_the_same_pool_with_and_without_them(masses):
+    unlimited = LinearSystem(masses.A, masses.B, masses.C, dt=masses.dt)
+    start = {"key": KEY, "radius": np.ones(6)}
+    free = lqr_pool(masses, 4, 6, **start, saturate=False)
+    assert np.abs(free.u).max() > 1
+    np.testing.assert_allclose(lqr_pool(unlimited, 4, 6, **start).u, free.u, rtol=0, atol=1e-13)
 
 
 def test_a_pool_starts_where_it_is_told(masses):
@@ -48,7 +80,7 @@ def test_a_pool_starts_where_it_is_told(masses):
 
 def test_the_controllers_of_a_pool_do_not_depend_on_its_starts(masses):
     def gain(**start):
-        pool = lqr_pool(masses, 1, 20, key=KEY, **start)
+        pool = lqr_pool(masses, 1, 20, key=KEY, saturate=False, **start)
         return np.linalg.lstsq(pool.x[0, :-1], pool.u[0], rcond=None)[0]
 
     expected = gain(radius=np.ones(6))

@@ -56,7 +56,9 @@ def test_the_book_s_calibration_is_what_the_code_gives():
 
 
 def test_people_answer_as_they_say():
-    pool = lqr_pool(oscillating_masses(), 30, 10, key=jax.random.key(2400), radius=RADIUS)
+    pool = lqr_pool(
+        oscillating_masses(), 30, 10, key=jax.random.key(2400), radius=RADIUS, saturate=False
+    )
     pairs = Comparisons(pool, np.arange(29), np.arange(1, 30), np.ones(29))
     coupled = _answered(pairs, "coupled", 1.0, np.random.default_rng(0))
     person = QuadraticCost(COUPLED_Q, np.diag([0.2, 0.2]))

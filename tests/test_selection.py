@@ -18,7 +18,9 @@ from prefmpc import (
 )
 from prefmpc.studies import RADIUS
 
-POOL = lqr_pool(oscillating_masses(), 30, 10, key=jax.random.key(2200), radius=RADIUS)
+POOL = lqr_pool(
+    oscillating_masses(), 30, 10, key=jax.random.key(2200), radius=RADIUS, saturate=False
+)
 TRUE = bryson(RADIUS, [1, 1], scale=3e-3)
 PERSON = logistic(QuadraticCost(TRUE.Q, TRUE.R), 1.0)
 ANSWERS = Comparisons.random(POOL, PERSON, 60, key=jax.random.key(2201)).sampled(

@@ -14,6 +14,7 @@ from hypothesis.extra.numpy import arrays
 
 from prefmpc import (
     LinearSystem,
+    NonlinearSystem,
     QuadraticCost,
     Trajectory,
     max_input,
@@ -111,6 +112,20 @@ def test_rollout_by_hand():
         np.testing.assert_array_equal(T.x, [[2, 0], [2, -1], [1, -2]])
         np.testing.assert_array_equal(T.u, [[-1], [-1]])
         np.testing.assert_array_equal(T.y, [[2], [2]])
+
+
+def test_rollout_applies_the_input_limits_on_demand():
+    # As above with −0.6 ≤ u ≤ 0.25: −1 becomes −0.6, and x_1 = (2, −0.6), x_2 = (1.4, −1.2);
+    # from (−2, 0) the input is 0.25.
+    limits = {"u_min": -0.6, "u_max": 0.25}
+    plant = LinearSystem([[1, 1], [0, 1]], [[0], [1]], [[1, 0]], dt=1, **limits)
+    same = NonlinearSystem(plant.step, plant.output, nx=2, nu=1, dt=1, **limits)
+    for law in ([[0.5, 0.0]], lambda x: -0.5 * x[:1]):
+        for system in (plant, same):
+            T = rollout(system, [[2, 0], [-2, 0]], law, 2, saturate=True)
+            np.testing.assert_allclose(T.x[0], [[2, 0], [2, -0.6], [1.4, -1.2]], atol=1e-15)
+            np.testing.assert_array_equal(T.u, [[[-0.6], [-0.6]], [[0.25], [0.25]]])
+            np.testing.assert_array_equal(rollout(system, [2, 0], law, 2).u, [[-1], [-1]])
 
 
 def test_rollout_of_a_batch_with_a_gain_each():

@@ -31,7 +31,9 @@ from prefmpc._chart import Chart, laplaces
 from prefmpc.studies import RADIUS
 from prefmpc.uncertainty import effective_draws
 
-POOL = lqr_pool(oscillating_masses(), 30, 10, key=jax.random.key(2100), radius=RADIUS)
+POOL = lqr_pool(
+    oscillating_masses(), 30, 10, key=jax.random.key(2100), radius=RADIUS, saturate=False
+)
 PRIOR = bryson(RADIUS, [1, 1], scale=1e-3)
 PERSON = logistic(QuadraticCost(2 * PRIOR.Q, PRIOR.R), 1.0)
 ANSWERS = Comparisons.random(POOL, PERSON, 40, key=jax.random.key(2101)).sampled(

@@ -70,7 +70,9 @@ def same_start_data(
     """Return ``size`` pairs with the same x(0), of ``starts`` times ``copies`` trajectories."""
     starts, copies = pool.pop("starts"), pool.pop("copies")
     x0 = starts_repeated(rng, starts, copies)
-    trajectories = lqr_pool(system, starts * copies, horizon, key=rng, x0=x0, **pool)
+    trajectories = lqr_pool(
+        system, starts * copies, horizon, key=rng, x0=x0, saturate=False, **pool
+    )
     return Comparisons.random(trajectories, preference, size, key=rng, same_start=True)
 
 
@@ -97,7 +99,9 @@ def baselines(*, key: Any) -> np.ndarray:
     table = []
     for system, horizon, preference, diagonal in cases:
         weights = [diagonal_weights(rng, n) if diagonal else None for n in (50, 200)]
-        mixed = lqr_pool(system, 50, horizon, key=rng, radius=RADIUS, weights=weights[0])
+        mixed = lqr_pool(
+            system, 50, horizon, key=rng, radius=RADIUS, weights=weights[0], saturate=False
+        )
         tests = [
             Comparisons.random(mixed, preference, 500, key=rng),
             same_start_data(
@@ -130,7 +134,9 @@ def measures_case(
     streams = generator(key).spawn(6)
     seed = int(streams[0].integers(2**32))
     system, pool, train, test = quadratic_data(key=np.random.default_rng(seed), sizes=sizes)
-    fresh_pool = lqr_pool(system, 100, QUADRATIC_HORIZON, key=streams[1], radius=RADIUS)
+    fresh_pool = lqr_pool(
+        system, 100, QUADRATIC_HORIZON, key=streams[1], radius=RADIUS, saturate=False
+    )
     fresh = Comparisons.random(fresh_pool, the_person(), 2000, key=streams[1])
     same = same_start_data(
         *(system, QUADRATIC_HORIZON, the_person(), 500, streams[2]), starts=50, copies=4

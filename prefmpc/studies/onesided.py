@@ -63,6 +63,7 @@ def option_pairs(size: int, *, key: Any, person: Any = ONE_SIDED) -> Comparisons
         QUADRATIC_HORIZON,
         key=streams[1],
         x0=np.repeat(starts, 2, axis=0),
+        saturate=False,
     )
     return ask_in_pairs(pool, person)
 

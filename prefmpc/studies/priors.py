@@ -174,7 +174,9 @@ def calibration_case(*, key: Any, pairs: int = 50) -> dict[str, np.ndarray]:
     prior = bryson(RADIUS, FORCE_MAX, scale=PERSON_SCALE)
     weights = [_draw(mode, prior.strength, streams[0]) for mode in (prior.Q, prior.R)]
     system = oscillating_masses()
-    pool, fresh = (lqr_pool(system, 50, 10, key=k, radius=RADIUS) for k in streams[1:3])
+    pool, fresh = (
+        lqr_pool(system, 50, 10, key=k, radius=RADIUS, saturate=False) for k in streams[1:3]
+    )
     drawn = logistic(QuadraticCost(*weights), 1.0)
     new = Comparisons.random(fresh, drawn, pairs, key=streams[3])
     first = _coverage(drawn, prior, "full", pool, new, streams[4])

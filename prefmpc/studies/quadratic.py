@@ -85,7 +85,7 @@ def quadratic_data(
     preference = the_person()
 
     def make_pool(pool_key: Any) -> Trajectory:
-        return lqr_pool(system, 50, QUADRATIC_HORIZON, key=pool_key, radius=RADIUS)
+        return lqr_pool(system, 50, QUADRATIC_HORIZON, key=pool_key, radius=RADIUS, saturate=False)
 
     pool = make_pool(streams[0])
     test_pool = pool if shared_pool else make_pool(streams[1])

@@ -116,7 +116,9 @@ def settling_data(
 
     def make_pool(rng: Any) -> Trajectory:
         weights = diagonal_weights(rng, 50)
-        return lqr_pool(system, 50, SETTLING_HORIZON, key=rng, radius=RADIUS, weights=weights)
+        return lqr_pool(
+            system, 50, SETTLING_HORIZON, key=rng, radius=RADIUS, weights=weights, saturate=False
+        )
 
     pool, test_pool = make_pool(streams[0]), make_pool(streams[1])
     seeds = streams[2].integers(0, 2**32, len(sizes) + 1)

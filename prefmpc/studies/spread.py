@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from prefmpc._files import atomic_write
 
 
 def write_spread(path: Path, head: Mapping[str, Any], draws: Sequence[Mapping[str, Any]]) -> None:
@@ -34,12 +35,8 @@ def write_spread(path: Path, head: Mapping[str, Any], draws: Sequence[Mapping[st
     ]
     text = json.dumps({**head, "draws": []}, ensure_ascii=False)
     text = text.removesuffix("]}") + "\n" + ",\n".join(rows) + "\n]}\n"
-    temporary = path.with_suffix(".part")
-    try:
-        temporary.write_text(text, encoding="utf-8")
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    with atomic_write(path, overwrite=True) as file:
+        file.write(text.encode())
 
 
 def read_spread(path: str | Path) -> dict[str, np.ndarray]:

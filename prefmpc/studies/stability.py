@@ -63,7 +63,9 @@ def learned(plant: str, *, key: Any) -> tuple[LinearSystem, QuadraticCost, float
     system = pendulum() if plant == "pendulum" else oscillating_masses()
     radius = RADII[plant]
     ask = QuadraticPreference(*PEOPLE[plant])
-    pools = [lqr_pool(system, size, JUDGED, key=rng, radius=radius) for size in (50, 100)]
+    pools = [
+        lqr_pool(system, size, JUDGED, key=rng, radius=radius, saturate=False) for size in (50, 100)
+    ]
     data = Comparisons.random(pools[0], ask, ANSWERS, key=rng)
     test = Comparisons.random(pools[1], ask, 500, key=rng)
     model = fit_map(data, bryson(radius, system.u_max), structure="diagonal").model
