@@ -20,11 +20,8 @@ from prefmpc.mpc._condensed import CondensedProblem
 from prefmpc.mpc._dual_method import dual_method
 from prefmpc.mpc._limits import ON_LIMIT, row_sizes
 
-STEPS = 120
+STEPS = 12
 """Active sets that are tried where there are input bounds alone."""
-
-TRIES = 3
-"""Changes of the whole active set that may be in vain before single ones are made."""
 
 LANES = 16
 """Problems that the dual method takes at a time, if they are small."""
@@ -98,6 +95,8 @@ def solve(problem: CondensedProblem, x0: Any, tol: Any, *, start: Any = None) ->
         found,
     )
     found, infeasible, limited = ended
+    if problem.fixed is None:  # input bounds alone always leave a plan, however bad
+        infeasible = dead & False
     U = jnp.clip(found.rows, data.lower, data.upper)[..., :n] * problem.scale[:, None]
     w = -(found.multipliers @ problem.Y)
     status = jnp.where(found.done & jnp.isfinite(U).all(-1), SOLVED, FAILED)
@@ -176,42 +175,14 @@ def _excess(data: _Data, rows: Any, high: Any, low: Any) -> Any:
     return jnp.where(high | low, rows - limits, 0.0)
 
 
-class _Guess(NamedTuple):
-    """Rows at their upper and lower limits (c, k, m); see `_next_guess`."""
-
-    high: Any
-    low: Any
-    fewest: Any
-    tries: Any
-
-
-def _next_guess(guess: _Guess, high: Any, low: Any) -> _Guess:
-    """Take over which rows look active, or only the last change if that has not helped lately.
-
-    Changing all at once needs few steps but may go round in circles; changing the one with the
-    largest index ends for sure if the rows are independent. Júdice and Pires' block pivoting.
-    """
-    changed = (high != guess.high) | (low != guess.low)
-    number = jnp.sum(changed, axis=-1)
-    better = number < guess.fewest
-    tries = jnp.where(better, TRIES, guess.tries - 1)
-    last = jnp.cumsum(changed[..., ::-1], axis=-1)[..., ::-1] == 1
-    taken = changed & ((tries >= 0)[..., None] | last)
-    return _Guess(
-        jnp.where(taken, high, guess.high),
-        jnp.where(taken, low, guess.low),
-        jnp.minimum(number, guess.fewest),
-        tries,
-    )
-
-
 def _active_set(
     problem: CondensedProblem, data: _Data, start: Any, free: _Search, dead: Any, tol: Any
 ) -> _Search:
     """Guess the active rows, solve for their multipliers, look which rows are active then.
 
     Hintermüller, Ito and Kunisch's primal-dual active-set method. Where the guess repeats itself
-    it is exact. The first guess is what was active at ``start``, if anything was.
+    it is exact; it may also go round in circles. The first guess is what was active at ``start``,
+    if anything was.
     """
     n = problem.Y.shape[-1]
     least = NOTHING * jnp.abs(start).max(-1, keepdims=True)
@@ -219,32 +190,28 @@ def _active_set(
     warm = jnp.any(pushed | pulled, axis=-1, keepdims=True)
 
     def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        k, now, guess, idle, softness = carry
+        k, now, before, idle, softness = carry
         high, low = _active(data, now.multipliers, now.rows)
         first = warm & (k == 0)
         high, low = jnp.where(first, pushed, high), jnp.where(first, pulled, low)
-        last, guess = guess, _next_guess(guess, high, low)
         idle |= now.done
-        active = (guess.high | guess.low) & ~idle[..., None]
+        active = (high | low) & ~idle[..., None]
         # From where λ is: repeated with the same rows it removes rounding errors.
         kept = jnp.where(active, now.multipliers, 0.0)
         rows = data.free - _moved(problem, kept)
-        rest = jnp.where(active, _excess(data, rows, guess.high, guess.low), 0.0)
+        rest = jnp.where(active, _excess(data, rows, high, low), 0.0)
         sizes = jnp.where(active, jnp.abs(data.free) + jnp.abs(rows), 0.0)
         exact = 10 * ROUNDING * jnp.linalg.norm(sizes, axis=-1)
         more, found = _conjugate_gradients(problem, active, rest, exact, limit=2 * n)
         # With the same rows as before there is little left to do, and little to learn from it.
-        same = ((last.high == guess.high) & (last.low == guess.low)).all(-1)
-        softness = jnp.where(same, jnp.maximum(found, softness), found)
+        softness = jnp.where((active == before).all(-1), jnp.maximum(found, softness), found)
         rows -= _moved(problem, more)
         new = _judged(data, kept + more, rows, softness, n, now.iterations + 1, tol)
         new = _kept(idle, now, new)
-        return k + 1, new, guess, idle | new.done, softness
+        return k + 1, new, active, idle | new.done, softness
 
     nowhere = jnp.zeros_like(data.free, dtype=bool)
-    m = data.free.shape[-1]
-    guess = _Guess(nowhere, nowhere, jnp.full(dead.shape, m + 1), free.iterations + TRIES)
-    begin = (0, free, guess, dead | free.done, jnp.ones(dead.shape))
+    begin = (0, free, nowhere, dead | free.done, jnp.ones(dead.shape))
     return jax.lax.while_loop(lambda carry: (carry[0] < STEPS) & ~jnp.all(carry[3]), step, begin)[1]
 
 

@@ -22,8 +22,11 @@ ROOM = 1e-13
 DEPENDENT = 1e-10
 """The part of a row that the active ones do not span has at least this length to count."""
 
-FAR = 1e7
+FAR = 1e8
 """There is no solution if every one would have to lie so many times as far out as w is."""
+
+HOPELESS = 1e9
+"""Where w has to be so many times as large as anything given, float64 has no digits left."""
 
 ROUNDS = 3
 """How often multipliers are computed afresh, and the method goes on from there."""
@@ -99,6 +102,8 @@ def dual_method(Y: Any, mine: Any, free: Any, lower: Any, upper: Any, skip: Any)
             return jnp.take_along_axis(own, p[:, None, None], axis=1)[:, 0]
 
     equal = lower == upper
+    given = [jnp.abs(free), *(jnp.where(jnp.isfinite(a), jnp.abs(a), 0.0) for a in (lower, upper))]
+    largest = jnp.max(jnp.stack(given), axis=(0, 2))
     slots = jnp.arange(n)
 
     def step(state: _State) -> _State:
@@ -106,7 +111,8 @@ def dual_method(Y: Any, mine: Any, free: Any, lower: Any, upper: Any, skip: Any)
         # The row to take up: the one begun, or the most violated.
         rows = rows_of(s.w)
         over, under = rows - upper, lower - rows
-        size = jnp.abs(free) + jnp.linalg.norm(s.w, axis=-1)[:, None]
+        radius = jnp.linalg.norm(s.w, axis=-1)
+        size = jnp.abs(free) + radius[:, None]
         beyond = jnp.maximum(over, under)
         worst = jnp.argmax(jnp.where(beyond > ROOM * size, beyond, 0.0), axis=-1)
         fresh = s.new < 0
@@ -130,9 +136,9 @@ def dual_method(Y: Any, mine: Any, free: Any, lower: Any, upper: Any, skip: Any)
         first = jnp.argmin(room, axis=-1)
         t = jnp.minimum(full, _at(room, first))
 
-        nowhere = ~arrived & ~jnp.isfinite(t)
         reach = violation / jnp.maximum(length, 1e-300)
-        proof = nowhere & (reach > FAR * jnp.linalg.norm(s.w, axis=-1)) & (reach > 0)
+        nowhere = ~arrived & (~jnp.isfinite(t) | (radius > HOPELESS * largest))
+        proof = nowhere & ~jnp.isfinite(t) & (reach > FAR * radius) & (reach > 0)
         done = s.done | arrived | nowhere | ~jnp.isfinite(violation)
         go = ~done
         t = jnp.where(go, t, 0.0)
