@@ -174,6 +174,7 @@ def mpc_rollout(
     """
     many = controllers(system, cost, constraints, terminal)
     horizon, steps = positive_int("horizon", horizon), positive_int("steps", steps)
+    tol = nonnegative("tol", tol)
     begin, lead = starts(x0, system.nx, many)
     out = _program(horizon, steps, derivative=True, thorough=many.sets is not None)(
         *many, many.systems, begin, tol

@@ -138,7 +138,8 @@ def posterior(result: MapResult, *, draws: int = 1024, key: Any = 0) -> Posterio
     problem = result.problem
     chart = Chart.of(problem)
     mode = laplaces([problem], [result.minimum.w])[0]
-    rng = np.random.default_rng(key) if isinstance(key, int) else generator(key)
+    whole = isinstance(key, (int, np.integer)) and not isinstance(key, bool) and key >= 0
+    rng = np.random.default_rng(key) if whole else generator(key)
     p, total = mode.eta.size, WARM_UP + steps
     noise = Noise(
         rng.standard_normal((CHAINS, p)),

@@ -291,11 +291,14 @@ def no_answer(first, second):
         (lambda: Comparisons.random(POOL[:1], PREFERENCE, 2, key=KEY), "at least two to compare"),
         (lambda: Comparisons.random(POOL.x, PREFERENCE, 2, key=KEY), "trajectories must be a Traj"),
         (lambda: Comparisons.random(POOL[0], PREFERENCE, 2, key=KEY), "trajectories must have one"),
-        (lambda: Comparisons.random(POOL, lambda a, b: 1, 2, key=KEY), "one label for each of the"),
+        (
+            lambda: Comparisons.random(POOL, lambda a, b: 1, 2, key=KEY),
+            "one answer in .* each pair",
+        ),
         (lambda: Comparisons.random(POOL, no_answer, 2, key=KEY), "it answered none of 2"),
         (
             lambda: Comparisons.random(POOL, lambda a, b: np.full(2, np.inf), 2, key=KEY),
-            "labels must be finite",
+            "preference must return one answer in .* with inf",
         ),
         (
             lambda: Comparisons.random(POOL, PREFERENCE, 2, key=KEY, same_start=True),

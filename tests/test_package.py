@@ -170,7 +170,7 @@ LAYERS = {
         *("priors", "convex", "uncertainty", "selection"),
         *("mpc", "evaluation", "loops", "studies"),
     },
-    "plots": set(),
+    "plots": {"_checks"},
 }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, instance, nonnegative, shaped
+from prefmpc._checks import finite_array, instance, nonnegative, shaped, single
 from prefmpc.models import QuadraticCost, SumCost
 from prefmpc.mpc._cone import expression, stage_limits
 from prefmpc.mpc.solution import MPCSolution
@@ -116,6 +116,7 @@ def check_stability(
 
     cp: Any = cvxpy
     instance("system", system, LinearSystem)
+    single("system", system)
     tol = nonnegative("tol", tol)
     nx, nu = system.nx, system.nu
     x, u = cp.Variable((1, nx)), cp.Variable((1, nu))
