@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from decimal import Decimal
 from numbers import Real
 from typing import Any
@@ -123,10 +124,20 @@ def single(name: str, value: Any, advice: str = "") -> None:
         raise ValueError(f"{name} must be a single model, got a stack {shape}{advice}")
 
 
-def function(name: str, value: Any) -> None:
-    """Raise a ValueError unless ``value`` can be called."""
-    if not callable(value):
+def function(name: str, value: Any, arguments: int) -> None:
+    """Raise a ValueError unless ``value`` can be called with so many arguments."""
+    if not callable(value) or isinstance(value, type):
         raise ValueError(f"{name} must be a function, got {value!r}")
+    try:
+        signature = inspect.signature(value)
+    except (TypeError, ValueError):  # some built-in functions have none
+        return
+    try:
+        signature.bind(*[None] * arguments)
+    except TypeError as error:
+        raise ValueError(
+            f"{name} must be a function of {arguments} argument(s), got {value!r}: {error}"
+        ) from None
 
 
 def choice(name: str, value: Any, options: Sequence[Any]) -> None:
@@ -146,12 +157,12 @@ def flag(name: str, value: Any) -> bool:
 
 def sequence(name: str, value: Any, wanted: str = "a sequence") -> list[Any]:
     """Return the entries of a list, tuple, array or any other iterable that is no text."""
+    if isinstance(value, (str, bytes, Mapping)) or not isinstance(value, Iterable):
+        raise ValueError(f"{name} must be {wanted}, got {type(value).__name__}")
     try:
-        if isinstance(value, (str, bytes, Mapping)):
-            raise TypeError
         return list(value)
-    except (TypeError, IndexError):
-        raise ValueError(f"{name} must be {wanted}, got {type(value).__name__}") from None
+    except TypeError as error:  # an array without dimensions
+        raise ValueError(f"{name} must be {wanted}: {error}") from None
 
 
 def instances(name: str, value: Any, wanted: type) -> list[Any]:
@@ -194,9 +205,27 @@ def broadcasts(name: str, batch: tuple[int, ...], models: tuple[int, ...]) -> No
         raise ValueError(f"{name} must have a leading shape that fits {models}, got {batch}")
 
 
+def indices(name: str, value: Any) -> np.ndarray:
+    """Return ``value`` as an array of whole numbers or of booleans, or raise a ValueError."""
+    try:
+        lost = isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value)
+        array = np.asarray(value)
+    except Exception as error:  # whatever the object's own conversion raises
+        raise ValueError(f"{name} must hold whole numbers: {error}") from None
+    if lost or (array.dtype.kind not in "iub" and array.size):
+        got = "masked entries" if lost else f"{array.dtype}"
+        raise ValueError(f"{name} must hold whole numbers, got {got} in shape {array.shape}")
+    return array if array.dtype == bool else array.astype(int)
+
+
+def is_whole(value: Any) -> bool:
+    """Whether ``value`` is a whole number: no bool, and no span of time, which NumPy counts in."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.timedelta64))
+
+
 def positive_int(name: str, value: Any) -> int:
     """Return ``value`` as an int of at least 1, or raise a ValueError."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+    if not is_whole(value) or value < 1:
         raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
     if value > LARGEST_INT:
         raise ValueError(f"{name} must be at most {LARGEST_INT}, got {value}")

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, flag, function, positive_int
+from prefmpc._checks import finite_array, flag, function, indices, positive_int
 from prefmpc._random import generator
 from prefmpc.preferences import Preference, asked
 from prefmpc.trajectories import Trajectory, failed
@@ -99,7 +99,7 @@ class Comparisons:
             trajectories must then hold some that start alike (see `lqr_pool`).
         """
         _check_pool(trajectories)
-        function("preference", preference)
+        function("preference", preference, 2)
         size = positive_int("size", size)
         count = len(trajectories)
         if count < 2:
@@ -159,17 +159,12 @@ class Comparisons:
 
     def subset(self, index: ArrayLike) -> Comparisons:
         """Return the comparisons chosen by an integer or boolean index, in that order."""
-        try:
-            chosen = np.asarray(index)
-        except Exception as error:  # whatever the object's own conversion raises
-            raise ValueError(f"index must hold whole numbers or booleans: {error}") from None
-        n = len(self)
+        chosen, n = indices("index", index), len(self)
         if chosen.dtype == bool:
-            fits = chosen.shape == (n,)
+            fits = chosen.shape == (n,) and bool(chosen.any())
         else:
-            whole = chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)
-            fits = whole and chosen.ndim == 1 and bool(((chosen >= -n) & (chosen < n)).all())
-            chosen = chosen.astype(int) if fits else chosen
+            inside = (chosen >= -n) & (chosen < n)
+            fits = chosen.ndim == 1 and chosen.size > 0 and bool(inside.all())
         if not fits:
             raise ValueError(f"index must choose among the {n} comparisons, got {chosen}")
         return Comparisons(
@@ -286,11 +281,8 @@ def _pairs_from_one_start(
 
 
 def _pair_indices(name: str, value: ArrayLike, size: int, count: int) -> np.ndarray:
-    try:
-        index = np.asarray(value)
-    except Exception as error:  # whatever the object's own conversion raises
-        raise ValueError(f"{name} must hold whole numbers: {error}") from None
-    if index.shape != (size,) or not np.issubdtype(index.dtype, np.integer):
+    index = indices(name, value)
+    if index.shape != (size,) or index.dtype == bool:
         raise ValueError(
             f"{name} must hold {size} whole numbers, one for each label, "
             f"got shape {index.shape} of {index.dtype}"

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from prefmpc._checks import flag, instance, nonnegative, positive_int, require_x64, to_numpy
+from prefmpc._checks import flag, instance, nonnegative, positive_int, require_x64, share, to_numpy
 from prefmpc._random import generator
 from prefmpc.comparisons import Comparisons
 from prefmpc.losses import FitError, PairData, cross_entropy, objective, padded_size, pair_data
@@ -134,6 +134,7 @@ def fit_network(
         positive_int("batch_size", batch_size),
     )
     rng, progress = generator(key), flag("progress", progress)
+    validation_fraction = share("validation_fraction", validation_fraction)
     training, held_out = _split(comparisons, validation, validation_fraction, rng)
     data = pair_data(starts, training, padded_size(len(training)))
     test = pair_data(starts, held_out, padded_size(len(held_out), 128))

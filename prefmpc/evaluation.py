@@ -30,7 +30,7 @@ def accuracy(model: Callable[[Trajectory], Any], comparisons: Comparisons) -> fl
 
     ``model`` is any function that maps a batch of trajectories (n_t,) to costs (n_t,).
     """
-    function("model", model)
+    function("model", model, 1)
     instance("comparisons", comparisons, Comparisons)
     costs = np.asarray(real_array("what model returns", model(comparisons.trajectories)))
     count = len(comparisons.trajectories)
@@ -70,7 +70,7 @@ def regret(
         If the trajectories do not start in the same states: costs from different x(0) do not
         compare. If one is not finite: a closed loop that failed has no cost.
     """
-    function("cost", cost)
+    function("cost", cost, 1)
     instance("trajectories", trajectories, Trajectory)
     values = _costs(cost, "trajectories", trajectories)
     if best is None:
@@ -131,7 +131,7 @@ def win_rate(
     ValueError
         If the trajectories do not start in the same states, or ``confidence`` is not in (0, 1).
     """
-    function("preference", preference)
+    function("preference", preference, 2)
     for name, value in {"first": first, "second": second}.items():
         instance(name, value, Trajectory)
         if len(value.batch_shape) != 1:
@@ -206,7 +206,7 @@ def simulate(
     """
     instance("system", system, System)
     single("system", system, "; closed_loops takes stacks")
-    function("controller", controller)
+    function("controller", controller, 1)
     x0 = np.asarray(check_state(x0, system.nx))
     steps = positive_int("steps", steps)
     starts = x0.reshape(-1, system.nx)

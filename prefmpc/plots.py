@@ -105,6 +105,9 @@ def boxes(
         A horizontal line to compare with.
     """
     samples = _named("values", values)
+    for label, sample in samples.items():
+        if sample.ndim != 1:
+            raise ValueError(f"values[{label!r}] must have shape (n,), got {sample.shape}")
     ax = ax if ax is not None else plt.subplots(figsize=(6.4, 3.2))[1]
     drawn = ax.boxplot(
         list(samples.values()),

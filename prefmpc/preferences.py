@@ -112,7 +112,7 @@ def by_criterion(criterion: Criterion, tolerance: float = 0.0) -> Preference:
     tolerance : float
         Differences up to it are not noticed: the answer is 0.5.
     """
-    function("criterion", criterion)
+    function("criterion", criterion, 1)
     tolerance = nonnegative("tolerance", tolerance)
 
     def preference(first: Trajectory, second: Trajectory) -> np.ndarray:
@@ -134,13 +134,13 @@ def lexicographic(*preferences: Preference) -> Preference:
     if not preferences:
         raise ValueError("preferences must hold at least one preference, got none")
     for i, preference in enumerate(preferences):
-        function(f"preferences[{i}]", preference)
+        function(f"preferences[{i}]", preference, 2)
 
     def combined(first: Trajectory, second: Trajectory) -> np.ndarray:
+        check_sides(first, second)
         if not first.batch_shape:
             pair = (jax.tree.map(lambda leaf: leaf[None], side) for side in (first, second))
             return combined(*pair)[0]
-        check_sides(first, second)
         answer = asked("preferences[0]", preferences[0], first, second).copy()
         for i, preference in enumerate(preferences[1:], 1):
             undecided = np.nonzero((answer == 0.5) | np.isnan(answer))
@@ -159,7 +159,7 @@ def erring(preference: Preference, rate: float) -> Preference:
     turns probabilities into answers. The right answer between one trajectory that is finite and
     one that is not is the finite one.
     """
-    function("preference", preference)
+    function("preference", preference, 2)
     rate = nonnegative("rate", rate)
     if rate > 1:
         raise ValueError(f"rate must lie in [0, 1], got {rate}")
@@ -179,7 +179,7 @@ def logistic(criterion: Criterion, scale: float) -> Preference:
     eq. (4) of arXiv 2511.22502 (Bradley and Terry): at a difference of ``scale`` the better one
     is chosen with 73 %. One that is not finite is never chosen, unless both are not: then P = 0.5.
     """
-    function("criterion", criterion)
+    function("criterion", criterion, 1)
     scale = positive("scale", scale)
 
     def preference(first: Trajectory, second: Trajectory) -> np.ndarray:
@@ -198,7 +198,7 @@ def one_by_one(ask: Callable[[Trajectory, Trajectory], float]) -> Preference:
     For anything that cannot be vectorised: a lookup, a simulation, a question to a person. About
     a trajectory that is not finite nobody is asked: the other one is preferred.
     """
-    function("ask", ask)
+    function("ask", ask, 2)
 
     def preference(first: Trajectory, second: Trajectory) -> np.ndarray:
         check_sides(first, second)

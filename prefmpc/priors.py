@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import positive, positive_vector, psd_matrix, sequence
+from prefmpc._checks import is_whole, positive, positive_vector, psd_matrix, sequence
 
 Structure = Literal["full", "diagonal"] | tuple[np.ndarray, np.ndarray]
 """Which entries of Q and R may differ from zero: by name, or as two masks (see `blocks`)."""
@@ -91,7 +91,7 @@ def blocks(
     for name, value in {"states": states, "inputs": inputs}.items():
         groups = [sequence(f"{name}[{i}]", g) for i, g in enumerate(sequence(name, value))]
         flat = [i for group in groups for i in group]
-        whole = all(isinstance(i, (int, np.integer)) and not isinstance(i, bool) for i in flat)
+        whole = all(map(is_whole, flat))
         if not flat or not whole or sorted(flat) != list(range(len(flat))):
             raise ValueError(
                 f"{name} must name each index 0 to {max(len(flat) - 1, 0)} in one group, "

@@ -87,7 +87,8 @@ def choose_prior(
     priors = instances("priors", priors, WishartPrior)
     choice("by", by, ("evidence", "cross_validation"))
     n = len(comparisons)
-    if by == "cross_validation" and not 2 <= positive_int("folds", folds) <= n:
+    folds = positive_int("folds", folds)
+    if by == "cross_validation" and not 2 <= folds <= n:
         raise ValueError(f"folds must lie between 2 and the {n} comparisons, got {folds}")
     C, entries = check([comparisons], priors, structure, outputs)
     problems = build(comparisons, priors, entries, C, padded_size(n))

@@ -13,8 +13,8 @@ from prefmpc._checks import (
     broadcasts,
     finite_array,
     instance,
+    is_whole,
     leading_shape,
-    positive_int,
     positive_vector,
 )
 from prefmpc._pytree import Stack, constant_like, register_pytree
@@ -95,7 +95,7 @@ class SeparableCost(Stack):
 
     def curve(self, signal: int, values: ArrayLike) -> np.ndarray:
         """Return h_i for values of one signal, in its unit: what a single step of it costs."""
-        if signal != 0 and positive_int("signal", signal) >= len(self.scale):
+        if not is_whole(signal) or not 0 <= signal < len(self.scale):
             raise ValueError(f"signal must lie in [0, {len(self.scale) - 1}], got {signal}")
         v = np.asarray(finite_array("values", values)) / self.scale[signal]
         absolute, square, fourth = np.moveaxis(np.asarray(self.c)[..., signal], -1, 0)

@@ -303,10 +303,9 @@ def _scores(models: Any, comparisons: Comparisons, kind: str) -> np.ndarray:
 def _starts(
     comparisons: Comparisons, initial: CostModel | None, restarts: int, key: Any
 ) -> CostModel:
-    trajectories = comparisons.trajectories
+    trajectories, restarts = comparisons.trajectories, positive_int("restarts", restarts)
     if initial is None:
         nx, nu = trajectories.x.shape[-1], trajectories.u.shape[-1]
-        restarts = positive_int("restarts", restarts)
         return QuadraticCost.random(nx, nu, key=key, shape=(restarts,))
     return check_starts(comparisons, initial)
 
@@ -332,7 +331,6 @@ def check_starts(comparisons: Comparisons, initial: Any) -> CostModel:
 
 def held_out_count(n: int, fraction: float, advice: str = "") -> int:
     """Return how many of n pairs are kept out of training: at least one, and not all of them."""
-    fraction = share("validation_fraction", fraction)
     count = max(1, round(fraction * n))
     if count >= n:
         raise ValueError(
@@ -349,6 +347,7 @@ def _check_options(
     if test is not None:
         instance("test", test, Comparisons)
     choice("selection", selection, get_args(Selection))
+    fraction = share("validation_fraction", fraction)
     if (test is None) == (selection == "leaky_test_accuracy"):
         raise ValueError(
             'test must be given with selection="leaky_test_accuracy" and only then, '

@@ -310,7 +310,7 @@ def no_answer(first, second):
         (lambda: Comparisons.from_arrays(X[0], U[0], X[0], U[0], [1]), "one leading dimension"),
         (lambda: Comparisons.from_arrays(X, U, X, U, [1]), "first must hold 1 whole"),
         (lambda: Comparisons.from_arrays(X * np.nan, U, X, U, [1, 1]), "x must be finite"),
-        (lambda: Comparisons(POOL, [0], [1], [1]).subset([]), "empty"),
+        (lambda: Comparisons(POOL, [0], [1], [1]).subset([]), "index must choose"),
         (lambda: Comparisons(POOL, [0], [1], [1]).subset([5]), "index must"),
         (lambda: Comparisons(POOL, [0], [1], [1]).save("data.csv"), "path must end in .npz"),
     ],

@@ -104,7 +104,7 @@ class NonlinearMPC(Controller):
         self.max_iterations = positive_int("max_iterations", max_iterations)
         self._path = path
         if path is not None:
-            function("path", path)
+            function("path", path, 2)
             _check_path(path, system)
         self._problem = self._sets(constraints, terminal)
         self._rows = shooting.rows(self._problem, path, self.horizon)

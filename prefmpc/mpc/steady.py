@@ -70,8 +70,8 @@ def steady_state(
         start = sequence("start", start)
         if len(start) != 2:
             raise ValueError(f"start must be (x, u), got {len(start)} entries")
-        x = np.asarray(shaped("start[0]", finite_array("start[0]", start[0]), (system.nx,)))
-        u = np.asarray(shaped("start[1]", finite_array("start[1]", start[1]), (system.nu,)))
+        x = np.asarray(shaped("start[0]", finite_array("start[0]", start[0], ndim=1), (system.nx,)))
+        u = np.asarray(shaped("start[1]", finite_array("start[1]", start[1], ndim=1), (system.nu,)))
     Z = stage_constraints(system, constraints)
     found = _search(system, wanted, Z, x, u)
     if found is None:
