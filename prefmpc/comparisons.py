@@ -154,6 +154,9 @@ class Comparisons:
                 f"{np.shape(second.y)}"
             )
         n = len(first)
+        labels = finite_array("labels", labels, booleans=True)
+        if labels.shape != (n,):
+            raise ValueError(f"labels must have shape ({n},), one a pair, got {labels.shape}")
         both = jax.tree.map(lambda a, b: np.concatenate([a, b]), first, second)
         return cls(both, np.arange(n), np.arange(n, 2 * n), labels)
 

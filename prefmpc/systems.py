@@ -164,6 +164,8 @@ class LinearSystem(System, Stack):
         block = np.zeros((nx + nu, nx + nu))
         block[:nx, :nx], block[:nx, nx:] = a, b
         held = scipy.linalg.expm(block * dt)
+        if not np.isfinite(held).all():
+            raise ValueError(f"dt must be short enough for A and B: the plant overflows in {dt} s")
         return cls(held[:nx, :nx], held[:nx, nx:], c, dt=dt, u_min=u_min, u_max=u_max)
 
     @classmethod

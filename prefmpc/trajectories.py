@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 from prefmpc._checks import (
     array_module,
     finite_array,
+    function,
     instance,
     is_traced,
     nonnegative,
@@ -266,6 +267,7 @@ def rollout(
     batch = starts.shape[:-1]
     flat = starts.reshape(-1, system.nx)
     if callable(law):
+        function("law", law, 1)
         x, u = _rollout_law(system, flat, steps, law)
     else:
         K = shaped("law", finite_array("law", law), (system.nu, system.nx), "a gain K")

@@ -1,4 +1,4 @@
-"""A valid call of everything public, whose arguments `test_malformed_inputs` replaces one by one."""
+"""Valid calls of everything public, whose arguments `test_malformed_inputs` replaces."""
 
 from __future__ import annotations
 
@@ -45,7 +45,10 @@ PLANT = {"A": SYSTEM.A, "B": SYSTEM.B, "C": np.eye(2), "dt": 0.1, **BOUNDS}
 LAYERS = {"b": [np.zeros(2)], "c": np.ones(2), "scale": np.ones(3), "over": "stage"}
 DRAWN = {"scale": np.ones(3), "key": KEY, "widths": (2,), "steps": 2, "shape": (2,), "floor": 0.0}
 MPC = {"system": SYSTEM, "cost": COST, "horizon": 3, "constraints": LIMITS}
-LOOP = {**MPC, "x0": np.ones((2, 2)), "steps": 2, "terminal": None, "tol": 1e-8}
+LOOP = {
+    **{"system": SYSTEM, "horizon": 3, "constraints": LIMITS, "x0": np.ones((2, 2))},
+    **{"steps": 2, "terminal": None, "tol": 1e-8},
+}
 SHARED = {"structure": "full", "outputs": np.eye(2)}
 NEWTON = {**SHARED, "max_iterations": 50, "tol": 1e-8}
 SIDES = {"first": POOL[:2], "second": POOL[2:4]}
@@ -309,10 +312,10 @@ def valid_calls():
             },
         ),
         "closed_loops": (
-            lambda cost, **rest: p.closed_loops(costs=cost, **rest),
-            {**LOOP, "plants": None, "mesh": None},
+            p.closed_loops,
+            {"costs": COST, **LOOP, "plants": None, "mesh": None},
         ),
-        "mpc_rollout": (p.mpc_rollout, LOOP),
+        "mpc_rollout": (p.mpc_rollout, {"cost": COST, **LOOP}),
         "terminal_ingredients": (
             p.terminal_ingredients,
             {"system": SYSTEM, "cost": COST, "constraints": LIMITS, "max_steps": 50, "tol": 1e-9},

@@ -113,9 +113,90 @@ def spoiled(value):
     return {**out, "as sparse": sp.csr_matrix(value)} if value.ndim == 2 else out
 
 
-ACCEPTED = {}
+TABLE = """
+negative, with 1e308 | A, B, x, u, F, MLPCost: c, x_r, u_r, x0, law, x_first, u_first, x_second
+negative, with 1e308 | u_second
+1.5, 10^30 | dt, cart, bob, length, force, wheelbase, steering_rate, brake, throttle, high
+1.5, 10^30 | logistic: scale, bryson: scale, strength, fit_global: l2
+None | LinearSystem.from_control: dt, g, ICNNCost.random: steps, MLPCost.random: steps
+None | lqr_pool: x0, weights, tie_break, NonlinearMPC: path, test, mesh, terminal, reference
+None | best
+nothing | LinearSystem.from_control: system, LinearSystem.lqr: Q, LinearSystem.lqr: R
+nothing | MapResult.probability: level, Comparisons: first, MapResult.probability: first
+nothing | Comparisons: second, MapResult.probability: second, regret: trajectories
+nothing | plots.boxes: values
+None, negative, with 1e308 | SecondOrderCone: g, c, y, Trajectory: y_r, u_before, y_first
+None, negative, with 1e308 | y_second, start
+0, 1.5, 10^30 | tol, epsilon, coupling, tolerance, floor, l2, l1, learning_rate
+with 1e308 | Q, R, masses, P, ICNNCost: c, lqr_pool: radius, scale
+nonlinear plant, plant | rollout: system, NonlinearMPC: system, steady_state: system
+nonlinear plant, plant | simulate: system
+failed pool, pool, shorter pool, trajectory | second_moments: trajectory, max_input: trajectory
+failed pool, pool, shorter pool, trajectory | settling_time: trajectory, select: trajectory
+longer, wider, with 1e308 | radius, SeparableCost.start: scale, ICNNCost.random: scale
+longer, wider, with 1e308 | MLPCost.random: scale
+True | bias, even, progress, nearest
+cost, costs | fit_network: initial, BatchedMPC: cost, closed_loops: costs, mpc_rollout: cost
+longer, wider | bryson: u_max, index, x_max
+plant, plants | BatchedMPC: system, closed_loops: system, mpc_rollout: system
+deeper, negative, with 1e308 | z, BatchedMPC.solve: x0, simulate: x0
+first negative, first with 1e308 | V, b, W
+1.5 | LinearSystem.from_continuous: dt, low
+0, 1.5, 10^30, inf | oscillating_masses: u_max, kappa
+one more | systems, choose_prior: priors
+empty, flatter, longer, negative, with 1e308 | closed_loops: x0, mpc_rollout: x0
+failed pool | first, second
+cost, costs, network | criterion, regret: cost
+0 | rate, signal
+cost, network | accuracy: model, cost
+[] | U, check_stability: output_cones
+cost | LinearMPC: cost, terminal_ingredients: cost
+negative | LinearSystem.from_continuous: A
+None, longer, negative, with 1e308 | C
+-1, -inf, 0, None, flatter, negative, with -inf | u_min
+-1, 0, 1.5, 10^30, None, flatter, inf, with 1e308, with inf | u_max
+plant | system
+0, 1.5, 10^30, flatter | stiffness
+negative, wider, with 1e308 | H
+negative, with 1e308, with inf | h
+-1, -inf, 0, flatter, negative, with -inf | lower
+-1, 0, 1.5, 10^30, flatter, inf, with 1e308, with inf | upper
+1.5, 10^30, inf | level
+-1, 0, 1.5, 10^30 | d
+deeper, with 1e308 | SeparableCost: c
+failed pool, pool, trajectory | trajectory
+deeper, empty, flatter, longer, negative, with 1e308 | rollout: x0
+key | key
+0, 10^30, 10^400, key | posterior: key
+says NaN | ask
+pool, shorter pool | trajectories
+pool | Comparisons.random: trajectories
+as booleans | labels
+cost, costs, larger cost, network | model
+-1, 0, 1.5, 10^30, [], deeper, empty, flatter, longer, negative, wider, with 1e308 | values
+one 9, one more | widths
+None, polyhedron | constraints
+polyhedron | soft_constraints: constraints
+0, 1.5, 10^30, flatter, with 1e308 | weight
+comparisons | comparisons
+None, cost, costs | initial
+prior | prior
+None, negative | outputs
+one more, prior | priors
+None, comparisons | validation
+[], one more | output_cones
+None, first negative, ragged | steady_state: start
+None, plant, plants | plants
+"""
+"""What is right after all | for which argument of all calls, or of one call, which goes before."""
+
+ACCEPTED = {
+    argument: labels.split(", ")
+    for labels, arguments in (line.split(" | ") for line in TABLE.strip().splitlines())
+    for argument in arguments.split(", ")
+}
 
 
 def accepted(name, argument):
-    """Return the labels of the values that are right for an argument."""
+    """Return the labels of the values that are right for an argument of a call."""
     return ACCEPTED.get(f"{name}: {argument}", ACCEPTED.get(argument, ()))

@@ -308,7 +308,7 @@ def no_answer(first, second):
         (lambda: Comparisons(POOL, [0], [1], [1]).sampled(key=0), "key must be a single JAX"),
         (lambda: Comparisons.from_arrays(X, U, X[:1], U[:1], [1, 1]), "must have equal shapes"),
         (lambda: Comparisons.from_arrays(X[0], U[0], X[0], U[0], [1]), "one leading dimension"),
-        (lambda: Comparisons.from_arrays(X, U, X, U, [1]), "first must hold 1 whole"),
+        (lambda: Comparisons.from_arrays(X, U, X, U, [1]), r"labels must have shape \(2,\)"),
         (lambda: Comparisons.from_arrays(X * np.nan, U, X, U, [1, 1]), "x must be finite"),
         (lambda: Comparisons(POOL, [0], [1], [1]).subset([]), "index must choose"),
         (lambda: Comparisons(POOL, [0], [1], [1]).subset([5]), "index must"),

@@ -7,6 +7,7 @@ replaced by what `malformed_values` holds. A few values of each argument are tri
 
 from __future__ import annotations
 
+import inspect
 import os
 import random
 import warnings
@@ -26,7 +27,14 @@ EXEMPT = {
     **dict.fromkeys(
         [
             *("ClosedLoops", "FitResult", "GlobalResult", "Interval", "MPCSolution", "Moments"),
-            *("NetworkFit", "PriorChoice", "SteadyState", "TerminalIngredients", "WinRate"),
+            *(
+                "NetworkFit",
+                "Posterior",
+                "PriorChoice",
+                "SteadyState",
+                "TerminalIngredients",
+                "WinRate",
+            ),
         ],
         "a result",
     ),
@@ -63,11 +71,11 @@ SPEAKERS = {"cost", "costs", "larger cost", "network", "shorter pool"}
 def is_named(argument, label, valid, said):
     if label.endswith("1e308"):  # an overflow may show up anywhere
         return True
-    if label in SPEAKERS and any(map(callable, valid.values())):
+    if label in SPEAKERS and (argument == "law" or any(map(callable, valid.values()))):
         return True
     if label in MISFITS or label.removeprefix("first ") in MISFITS:
         return any(other in said for other in valid)
-    return argument in said
+    return argument.removesuffix("s") in said  # one of several may be meant
 
 
 def complaint(name, argument, label, value):
@@ -94,10 +102,13 @@ def test_malformed_input_is_refused_by_name():
     assert {trial: said for trial, said in answers.items() if said} == {}
 
 
-def test_every_valid_call_names_all_arguments_that_there_are():
-    pass
+def test_every_argument_is_tried():
+    for name, (function, valid) in valid_calls().items():
+        assert inspect.signature(function).parameters.keys() == valid.keys(), name
+        if EVERYTHING and name != "Comparisons.load":  # of a file that is not there
+            function(**valid)
 
 
 def test_everything_public_is_tried_or_exempt():
     tried = {name.split(".")[0].split("(")[0].strip() for name in valid_calls()}
-    assert set(p.__all__) - tried == EXEMPT.keys()
+    assert set(p.__all__) - tried <= EXEMPT.keys() <= set(p.__all__)
