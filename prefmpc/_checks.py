@@ -20,6 +20,9 @@ LARGEST_INT = 2**31 - 1
 SYMMETRIC = 1e-9
 """So far a matrix may be from its transpose: rounding, in units in which its diagonal is 1."""
 
+UNDERFLOW = 1e-290
+"""On a diagonal this is 0: products of such weights are no numbers any more."""
+
 INDEFINITE = 1e-10
 """So far below 0 an eigenvalue of a semidefinite matrix may be: rounding, in the same units."""
 
@@ -312,21 +315,23 @@ def psd_matrix(
     if not stack and matrix.ndim != 2:
         raise ValueError(f"{name} must be one matrix, got shape {matrix.shape}")
     diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
-    size = np.sqrt(np.abs(diagonal))
+    small = np.abs(diagonal) < UNDERFLOW
+    size = np.sqrt(np.maximum(np.abs(diagonal), UNDERFLOW))
     lengths = size[..., :, None] * size[..., None, :]
     transposed = np.swapaxes(matrix, -1, -2)
     if (np.abs(matrix - transposed) > SYMMETRIC * np.maximum(lengths, np.abs(matrix))).any():
         raise ValueError(f"{name} must be symmetric, got a matrix that differs from its transpose")
     kind = "definite" if definite else "semidefinite"
-    if (diagonal < 0).any() or (definite and (diagonal == 0).any()):
+    if (diagonal[~small] < 0).any() or (definite and small.any()):
         raise ValueError(
             f"{name} must be positive {kind}, got {diagonal.min():.3g} on its diagonal"
         )
-    if ((lengths == 0) & (matrix != 0)).any():
+    nothing = small[..., :, None] | small[..., None, :]
+    if (nothing & (np.abs(matrix) > lengths)).any():
         raise ValueError(
             f"{name} must be positive {kind}, got a row that is not zero with 0 on its diagonal"
         )
-    matrix = matrix / 2 + transposed / 2
+    matrix = np.where(nothing, 0.0, matrix / 2 + transposed / 2)
     smallest = float(np.linalg.eigvalsh(unit_diagonal(matrix)[0]).min(initial=np.inf))
     least = np.finfo(float).eps * matrix.shape[-1] if definite else -INDEFINITE
     if not smallest >= least:

@@ -240,10 +240,10 @@ class SumCost:
 register_pytree(SumCost, static=("weights",))
 
 
-def check_model(name: str, value: Any) -> None:
+def check_model(name: str, value: Any, wanted: str = "a σ model") -> None:
     """Raise a ValueError unless ``value`` is a σ model."""
     if isinstance(value, type) or not isinstance(value, CostModel):
-        raise ValueError(f"{name} must be a σ model, got {type(value).__name__}")
+        raise ValueError(f"{name} must be {wanted}, got {type(value).__name__}")
 
 
 @cache

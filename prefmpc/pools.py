@@ -58,7 +58,7 @@ def random_states(radius: ArrayLike, *, key: Any, shape: tuple[int, ...] = ()) -
     """Draw states ``(*shape, nx)``, each entry uniform in [−radius, radius]; radius is (nx,)."""
     radius = np.asarray(finite_array("radius", radius, ndim=1))
     if not radius.size or (radius < 0).any():
-        raise ValueError(f"radius must hold numbers that are not negative, got {radius}")
+        raise ValueError(f"radius must not be negative or empty, got {radius}")
     shape = leading_shape("shape", shape)
     return generator(key).uniform(-1.0, 1.0, (*shape, radius.size)) * radius
 

@@ -314,7 +314,7 @@ def check_starts(comparisons: Comparisons, initial: Any) -> CostModel:
     """Return the starts, stacked along one leading axis, or raise a ValueError."""
     if isinstance(initial, QuadraticCost) and not initial.batch_shape:
         initial = jax.tree.map(lambda leaf: leaf[None], initial)
-    check_model("initial", initial)
+    check_model("initial", initial, "a stack of σ models")
     # The weights of a single network may all have the same first dimension.
     if any(getattr(m, "batch_shape", None) == () for m in getattr(initial, "models", (initial,))):
         raise ValueError("initial must be stacked along one leading axis, got a single model")

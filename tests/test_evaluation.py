@@ -29,6 +29,7 @@ from prefmpc import (
     simulate,
     win_rate,
 )
+from prefmpc._pytree import bypass_init
 from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
 KEY = jax.random.key(2000)
@@ -234,6 +235,45 @@ def still(x):
 TWO = runs([1, 2])
 SHIFTED = runs([1, 2], start=1)
 APART = jax.tree.map(lambda *leaves: np.stack(leaves), TWO, SHIFTED)
+
+
+def failing(trajectories, *which):
+    """The same trajectories, some with NaN from the first input on."""
+    x, u = trajectories.x.copy(), trajectories.u.copy()
+    x[list(which), 1:], u[list(which)] = np.nan, np.nan
+    return bypass_init(Trajectory, x=x, u=u, y=x[..., :-1, :])
+
+
+def test_a_failed_loop_never_wins():
+    good = runs([1.0, 1, 1, 1])
+    failed = failing(good, 0, 1, 2, 3)
+    for preference in (
+        QuadraticPreference([[1]], [[1]]),
+        lambda a, b: np.zeros(len(a)),  # of somebody who always takes the second
+        lambda a, b: np.full(len(a), np.nan),
+    ):
+        assert win_rate(preference, good, failed).rate == 1
+        assert win_rate(preference, failed, good).rate == 0
+        assert win_rate(preference, failed, failed).rate == 0.5
+    # 1 fails: lost, 2 fail of both: half, the others are equal: half.
+    mixed = win_rate(QuadraticPreference([[1]], [[1]]), failing(good, 0, 1), failing(good, 1))
+    assert mixed.rate == pytest.approx((0 + 0.5 + 0.5 + 0.5) / 4)
+    with pytest.raises(ValueError, match="trajectories must be finite, got 2 of 4 with NaN"):
+        regret(effort, failing(good, 0, 1), good)
+    with pytest.raises(ValueError, match="best must be finite, got 1 of 4"):
+        regret(effort, good, failing(good, 2))
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_same_starts_whatever_the_unit(unit):
+    def scaled(start):
+        T = runs([1.0, 2], start)
+        return Trajectory(unit * T.x, T.u)
+
+    prefers_first = by_criterion(effort)
+    assert win_rate(prefers_first, scaled(1.0), scaled(1.0 + 1e-12)).rate == 0.5
+    with pytest.raises(ValueError, match="second must start in the same states"):
+        win_rate(prefers_first, scaled(1.0), scaled(1.001))
 
 
 @pytest.mark.parametrize(

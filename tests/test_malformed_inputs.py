@@ -74,7 +74,7 @@ def is_named(argument, label, valid, said):
     if label in SPEAKERS and (argument == "law" or any(map(callable, valid.values()))):
         return True
     if label in MISFITS or label.removeprefix("first ") in MISFITS:
-        return any(other in said for other in valid)
+        return any(other.removesuffix("s") in said for other in valid)
     return argument.removesuffix("s") in said  # one of several may be meant
 
 

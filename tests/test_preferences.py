@@ -20,6 +20,7 @@ from prefmpc import (
     one_by_one,
     settling_time,
 )
+from prefmpc._pytree import bypass_init
 
 RNG = np.random.default_rng(0)
 POOL = Trajectory(*(RNG.normal(size=(6, *s)) for s in [(4, 2), (3, 1), (3, 5)]))
@@ -205,6 +206,56 @@ def test_both_orders_of_a_pair_give_the_same_person(a, b, scale):
     sure = by_criterion(criterion)(first, second)
     np.testing.assert_array_equal(sure + by_criterion(criterion)(second, first), 1)
     assert (np.sign(p - 0.5) * np.sign(sure - 0.5) >= 0).all()
+
+
+def broken(trajectories, *, field="x"):
+    """The same trajectories with NaN from the second step on, in the states or in the inputs."""
+    parts = {name: getattr(trajectories, name).copy() for name in ("x", "u", "y")}
+    parts[field][..., 1:, :] = NAN
+    return bypass_init(Trajectory, **parts)
+
+
+LOSES_TO_NONE = {
+    "quadratic": PREFERENCE,
+    "settling": SettlingTimePreference(),
+    "settling alone": SettlingTimePreference(tie_break=None),
+    "criterion": by_criterion(max_input, 1e9),
+    "criterion with NaN": by_criterion(lambda T: T.x.sum((-1, -2))),
+    "lexicographic": lexicographic(by_criterion(max_input, 1e9), lambda a, b: np.zeros(len(a))),
+    "logistic": logistic(lambda T: np.full(T.batch_shape, INF), 1.0),
+    "one by one": one_by_one(lambda a, b: float("nan") if np.isnan(a.x).any() else 0.5),
+}
+
+
+@pytest.mark.parametrize("name", LOSES_TO_NONE)
+@pytest.mark.parametrize("field", ["x", "u", "y"])
+def test_a_failed_loop_is_worse_than_every_other(name, field):
+    preference = LOSES_TO_NONE[name]
+    # The bad ones are as bad as it gets: they never settle, and push hard.
+    bad = Trajectory(1e3 + POOL.x, 1e3 + POOL.u, 1e3 + POOL.y)
+    failed = broken(POOL, field=field)
+    np.testing.assert_array_equal(preference(bad, failed), 1)
+    np.testing.assert_array_equal(preference(failed, bad), 0)
+    np.testing.assert_array_equal(preference(failed, failed), 0.5)
+    if name != "one by one":
+        assert preference(bad[0], failed[0]) == 1
+    np.testing.assert_allclose(erring(preference, 0.1)(bad, failed), 0.9)
+    np.testing.assert_allclose(erring(preference, 0.1)(failed, bad), 0.1)
+
+
+def test_no_answer_about_two_failed_loops_where_ties_are_dropped():
+    failed = broken(POOL)
+    assert np.isnan(SettlingTimePreference(tie_break=None, ties="drop")(failed, failed)).all()
+
+
+def test_nobody_is_asked_about_a_failed_loop():
+    asked = []
+    ask = one_by_one(lambda a, b: asked.append(a) or 1.0)
+    first = Trajectory(*(np.concatenate([leaf[:2], leaf[:2]]) for leaf in (POOL.x, POOL.u, POOL.y)))
+    second = bypass_init(Trajectory, x=first.x.copy(), u=first.u, y=first.y)
+    second.x[1] = NAN
+    np.testing.assert_array_equal(ask(first, second), 1)
+    assert len(asked) == 3
 
 
 def constant(value):

@@ -203,6 +203,24 @@ def test_bad_input_is_named(call, words):
         call()
 
 
+def test_equal_bounds_lock_and_infinite_limits_bound_nothing():
+    locked = plant(u_min=0.5, u_max=0.5)
+    np.testing.assert_array_equal(locked.u_min, locked.u_max)
+    assert Polyhedron.box([0, 1], [1, 1]).contains([[0.5, 1], [0.5, 0.9]]).tolist() == [True, False]
+    half = Polyhedron([[1, 0], [0, 1]], [1, INF])
+    np.testing.assert_array_equal(half.H, [[1, 0]])
+    np.testing.assert_array_equal(half.h, [1])
+    assert half.contains([0.5, 1e300])
+    assert Polyhedron([[1, 0]], [INF]).contains([1e9, 0])
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_on_a_limit_in_any_unit(unit):
+    box = Polyhedron(np.eye(2), unit * np.array([1.0, 0.0]))
+    z = unit * np.array([[1 + 1e-12, 0], [1 + 1e-6, 0], [1, 1e-6]])
+    assert box.contains(z).tolist() == [True, False, False]
+
+
 @given(arrays(float, (20, 3), elements=st.floats(-3, 3)))
 def test_a_box_holds_what_lies_between_its_bounds(z):
     box = Polyhedron.box([-1, -INF, 0], [1, 2, INF])

@@ -118,7 +118,8 @@ def terminal_ingredients(
     if (Z.h <= 0).any():
         raise ValueError(
             f"constraints must hold the origin inside: all h > 0, got {Z.h.min():g} in row "
-            f"{int(Z.h.argmin())} (the input bounds come first)"
+            f"{int(Z.h.argmin())} (the input bounds come first; an input that is locked by equal "
+            "ones has no place in B here)"
         )
     K, P = system.lqr(cost.Q, cost.R)
     closed = system.A - system.B @ K
