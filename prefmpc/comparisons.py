@@ -154,11 +154,11 @@ class Comparisons:
                 f"{np.shape(second.y)}"
             )
         n = len(first)
-        labels = finite_array("labels", labels, booleans=True)
-        if labels.shape != (n,):
-            raise ValueError(f"labels must have shape ({n},), one a pair, got {labels.shape}")
+        answers = finite_array("labels", labels, booleans=True)
+        if answers.shape != (n,):
+            raise ValueError(f"labels must have shape ({n},), one a pair, got {answers.shape}")
         both = jax.tree.map(lambda a, b: np.concatenate([a, b]), first, second)
-        return cls(both, np.arange(n), np.arange(n, 2 * n), labels)
+        return cls(both, np.arange(n), np.arange(n, 2 * n), answers)
 
     def subset(self, index: ArrayLike) -> Comparisons:
         """Return the comparisons chosen by an integer or boolean index, in that order."""

@@ -388,8 +388,10 @@ def _paired(
     priors: WishartPrior | Sequence[WishartPrior],
 ) -> tuple[list[Comparisons], list[WishartPrior]]:
     one_set, one_prior = isinstance(comparisons, Comparisons), isinstance(priors, WishartPrior)
-    data_sets = [comparisons] if one_set else instances("comparisons", comparisons, Comparisons)
-    beliefs = [priors] if one_prior else instances("priors", priors, WishartPrior)
+    data_sets: list[Any] = (
+        [comparisons] if one_set else instances("comparisons", comparisons, Comparisons)
+    )
+    beliefs: list[Any] = [priors] if one_prior else instances("priors", priors, WishartPrior)
     if one_set:
         data_sets *= len(beliefs)
     elif one_prior:

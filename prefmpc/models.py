@@ -287,6 +287,6 @@ def _semidefinite_factor(matrix: np.ndarray) -> np.ndarray:
         # A singular matrix has no unique Cholesky factor; the QR of a square root gives one.
         scaled, size = unit_diagonal(matrix)
         values, vectors = np.linalg.eigh(scaled)
-        upper = np.linalg.qr((vectors * np.sqrt(np.clip(values, 0, None))).T, mode="r")
-        signs = np.where(np.diagonal(upper) < 0, -1.0, 1.0)
-        return size[:, None] * upper.T * signs
+        root = vectors * np.sqrt(np.clip(values, 0, None))
+        lower = np.asarray(np.linalg.qr(root.T, mode="r")).T
+        return size[:, None] * lower * np.where(np.diagonal(lower) < 0, -1.0, 1.0)

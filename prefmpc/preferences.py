@@ -139,8 +139,7 @@ def lexicographic(*preferences: Preference) -> Preference:
     def combined(first: Trajectory, second: Trajectory) -> np.ndarray:
         check_sides(first, second)
         if not first.batch_shape:
-            pair = (jax.tree.map(lambda leaf: leaf[None], side) for side in (first, second))
-            return combined(*pair)[0]
+            return combined(*(jax.tree.map(lambda leaf: leaf[None], T) for T in (first, second)))[0]
         answer = asked("preferences[0]", preferences[0], first, second).copy()
         for i, preference in enumerate(preferences[1:], 1):
             undecided = np.nonzero((answer == 0.5) | np.isnan(answer))

@@ -68,7 +68,8 @@ def bryson(
     """
     scale = positive("scale", scale)
     limits = positive_vector("x_max", x_max), positive_vector("u_max", u_max)
-    return WishartPrior(*(np.diag(scale / limit**2) for limit in limits), strength)
+    Q, R = (np.diag(scale / limit**2) for limit in limits)
+    return WishartPrior(Q, R, strength)
 
 
 def blocks(
