@@ -2,12 +2,29 @@
 
 from __future__ import annotations
 
+import inspect
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from decimal import Decimal
+from numbers import Real
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
+
+LARGEST_INT = 2**31 - 1
+"""Of whole numbers: compiled loops count with 32 bits."""
+
+SYMMETRIC = 1e-9
+"""So far a matrix may be from its transpose: rounding, in units in which its diagonal is 1."""
+
+UNDERFLOW = 1e-290
+"""On a diagonal this is 0: products of such weights are no numbers any more."""
+
+INDEFINITE = 1e-10
+"""So far below 0 an eigenvalue of a semidefinite matrix may be: rounding, in the same units."""
 
 
 def require_x64() -> None:
@@ -38,22 +55,52 @@ def to_numpy(tree: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf if is_traced(leaf) else np.asarray(leaf), tree)
 
 
-def finite_array(name: str, value: Any, ndim: int | None = None, *, allow_inf: bool = False) -> Any:
-    """Return ``value`` as a float64 array; raise a ValueError if it cannot be one or has NaN.
+def real_array(name: str, value: Any, *, booleans: bool = False) -> Any:
+    """Return ``value`` as a float64 array, or raise a ValueError if it is not made of real numbers.
 
-    ``ndim`` is the exact number of dimensions wanted (None: any). NumPy stays NumPy, JAX stays
-    JAX. Tracers pass through: only their shape can be checked.
+    NumPy alone would read "1" and b"1" as numbers, forget masks and take None for NaN.
+    ``booleans``: take True for 1 and False for 0. NumPy stays NumPy, JAX stays JAX.
     """
     require_x64()
-    if np.iscomplexobj(value):
-        raise ValueError(f"{name} must be an array of real numbers, got complex ones")
+    kinds = "fiub" if booleans else "fiu"
     if isinstance(value, jax.Array):
-        array: Any = value if value.dtype == jnp.float64 else value.astype(jnp.float64)
-    else:
-        try:
-            array = np.asarray(value, dtype=np.float64)
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"{name} must be an array of real numbers: {error}") from None
+        plain = not jnp.issubdtype(value.dtype, jax.dtypes.extended)
+        if not plain or np.dtype(value.dtype).kind not in kinds + "V":  # V: bfloat16 and the like
+            raise ValueError(f"{name} must be an array of real numbers, got {value.dtype}")
+        return value if value.dtype == jnp.float64 else value.astype(jnp.float64)
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return value
+    parts = value if isinstance(value, (list, tuple)) else (value,)
+    if any(isinstance(part, np.ma.MaskedArray) and np.ma.is_masked(part) for part in parts):
+        raise ValueError(f"{name} must have all its entries, got a masked array that lacks some")
+    try:
+        array = np.asarray(value)
+        good = array.dtype.kind in kinds
+        if array.dtype.kind == "O" and array.size:  # whole numbers beyond 64 bits, fractions, …
+            entries = [getattr(entry, "item", lambda e=entry: e)() for entry in array.ravel()]
+            good = all(isinstance(e, (Real, Decimal)) and not isinstance(e, bool) for e in entries)
+        if good:
+            return array.astype(np.float64, copy=False)
+    except Exception as error:  # whatever the object's own conversion raises
+        raise ValueError(f"{name} must be an array of real numbers: {error}") from None
+    got = type(value).__name__ if array.ndim == 0 else f"an array of {array.dtype}"
+    raise ValueError(f"{name} must be an array of real numbers, got {got}")
+
+
+def finite_array(
+    name: str,
+    value: Any,
+    ndim: int | None = None,
+    *,
+    allow_inf: bool = False,
+    booleans: bool = False,
+) -> Any:
+    """Return ``value`` as a float64 array; raise a ValueError if it cannot be one or has NaN.
+
+    ``ndim`` is the exact number of dimensions wanted (None: any). For ``booleans`` and the kind
+    of array see `real_array`. Tracers pass through: only their shape can be checked.
+    """
+    array = real_array(name, value, booleans=booleans)
     if ndim is not None and array.ndim != ndim:
         raise ValueError(f"{name} must have {ndim} dimension(s), got shape {array.shape}")
     if not is_traced(array):
@@ -74,10 +121,71 @@ def instance(name: str, value: Any, wanted: type) -> None:
         raise ValueError(f"{name} must be a {wanted.__name__}, got {type(value).__name__}")
 
 
-def function(name: str, value: Any) -> None:
-    """Raise a ValueError unless ``value`` can be called."""
-    if not callable(value):
+def single(name: str, value: Any, advice: str = "") -> None:
+    """Raise a ValueError if ``value`` is a stack of many."""
+    if shape := getattr(value, "batch_shape", ()):
+        raise ValueError(f"{name} must be a single model, got a stack {shape}{advice}")
+
+
+def function(name: str, value: Any, arguments: int) -> None:
+    """Raise a ValueError unless ``value`` can be called with so many arguments."""
+    if not callable(value) or isinstance(value, type):
         raise ValueError(f"{name} must be a function, got {value!r}")
+    try:
+        signature = inspect.signature(value)
+    except (TypeError, ValueError):  # some built-in functions have none
+        return
+    try:
+        signature.bind(*[None] * arguments)
+    except TypeError as error:
+        raise ValueError(
+            f"{name} must be a function of {arguments} argument(s), got {value!r}: {error}"
+        ) from None
+
+
+def choice(name: str, value: Any, options: Sequence[Any]) -> None:
+    """Raise a ValueError unless ``value`` is one of the ``options``: texts, or None."""
+    if not (value is None or isinstance(value, str)) or value not in options:
+        quoted = ["None" if option is None else f'"{option}"' for option in options]
+        wish = " or ".join(quoted) if len(options) == 2 else f"one of {tuple(options)}"
+        raise ValueError(f"{name} must be {wish}, got {value!r}")
+
+
+def flag(name: str, value: Any) -> bool:
+    """Return ``value`` as a bool, or raise a ValueError."""
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"{name} must be True or False, got {value!r}")
+    return bool(value)
+
+
+def sequence(name: str, value: Any, wanted: str = "a sequence") -> list[Any]:
+    """Return the entries of a list, tuple, array or any other iterable that is no text."""
+    if isinstance(value, (str, bytes, Mapping)) or not isinstance(value, Iterable):
+        raise ValueError(f"{name} must be {wanted}, got {type(value).__name__}")
+    try:
+        return list(value)
+    except TypeError as error:  # an array without dimensions
+        raise ValueError(f"{name} must be {wanted}: {error}") from None
+
+
+def instances(name: str, value: Any, wanted: type) -> list[Any]:
+    """Return a sequence of at least one ``wanted`` as a list, or raise a ValueError."""
+    wish = f"a sequence of at least one {wanted.__name__}"
+    if isinstance(value, wanted):
+        raise ValueError(f"{name} must be {wish}, got a single one")
+    entries = sequence(name, value, wish)
+    if not entries:
+        raise ValueError(f"{name} must be {wish}, got none")
+    for entry in entries:
+        instance(name, entry, wanted)
+    return entries
+
+
+def leading_shape(name: str, value: Any) -> tuple[int, ...]:
+    """Return ``value`` as a tuple of whole numbers of at least 1, or raise a ValueError."""
+    if not isinstance(value, tuple):
+        raise ValueError(f"{name} must be a tuple of whole numbers, got {value!r}")
+    return tuple(positive_int(f"{name}[{i}]", size) for i, size in enumerate(value))
 
 
 def shaped(name: str, array: Any, shape: tuple[int | None, ...], meaning: str = "") -> Any:
@@ -93,27 +201,90 @@ def shaped(name: str, array: Any, shape: tuple[int | None, ...], meaning: str = 
     return array
 
 
+def broadcasts(name: str, batch: tuple[int, ...], models: tuple[int, ...]) -> None:
+    """Raise a ValueError unless a leading shape fits that of a stack of models."""
+    pairs = zip(models[::-1], batch[::-1], strict=False)
+    if not all(a == b or 1 in (a, b) for a, b in pairs):
+        raise ValueError(f"{name} must have a leading shape that fits {models}, got {batch}")
+
+
+def indices(name: str, value: Any) -> np.ndarray:
+    """Return ``value`` as an array of whole numbers or of booleans, or raise a ValueError."""
+    try:
+        lost = isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value)
+        array = np.asarray(value)
+    except Exception as error:  # whatever the object's own conversion raises
+        raise ValueError(f"{name} must hold whole numbers: {error}") from None
+    if lost or (array.dtype.kind not in "iub" and array.size):
+        got = "masked entries" if lost else f"{array.dtype}"
+        raise ValueError(f"{name} must hold whole numbers, got {got} in shape {array.shape}")
+    return array if array.dtype == bool else array.astype(int)
+
+
+def is_whole(value: Any) -> bool:
+    """Whether ``value`` is a whole number: no bool, and no span of time, which NumPy counts in."""
+    return isinstance(value, (int, np.integer)) and not isinstance(value, (bool, np.timedelta64))
+
+
 def positive_int(name: str, value: Any) -> int:
     """Return ``value`` as an int of at least 1, or raise a ValueError."""
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 1:
+    if not is_whole(value) or value < 1:
         raise ValueError(f"{name} must be a whole number of at least 1, got {value!r}")
+    if value > LARGEST_INT:
+        raise ValueError(f"{name} must be at most {LARGEST_INT}, got {value}")
     return int(value)
 
 
-def nonnegative(name: str, value: Any) -> float:
-    """Return ``value`` as a finite float of at least 0, or raise a ValueError."""
-    if isinstance(value, bool) or not isinstance(value, (int, float, np.number)):
-        raise ValueError(f"{name} must be a number of at least 0, got {value!r}")
-    if not np.isfinite(value) or value < 0:
-        raise ValueError(f"{name} must be finite and at least 0, got {value!r}")
-    return float(value)
+def number(name: str, value: Any, wish: str = "a number") -> float:
+    """Return ``value`` as a float, which may be infinite or NaN, or raise a ValueError."""
+    try:
+        if is_traced(value):
+            raise ValueError
+        return float(real_array(name, value).reshape(()))
+    except ValueError:
+        raise ValueError(f"{name} must be {wish}, got {value!r}") from None
+
+
+def finite(name: str, value: Any) -> float:
+    """Return ``value`` as a finite float, or raise a ValueError."""
+    out = number(name, value)
+    if not math.isfinite(out):
+        raise ValueError(f"{name} must be finite, got {value!r}")
+    return out
+
+
+def nonnegative(name: str, value: Any, *, allow_inf: bool = False) -> float:
+    """Return ``value`` as a float of at least 0, or raise a ValueError."""
+    out = number(name, value, "a number of at least 0")
+    if not (0 <= out < np.inf or (allow_inf and out == np.inf)):
+        wish = "at least 0" if allow_inf else "finite and at least 0"
+        raise ValueError(f"{name} must be {wish}, got {value!r}")
+    return out
+
+
+def positive(name: str, value: Any, *, allow_inf: bool = False) -> float:
+    """Return ``value`` as a float above 0, or raise a ValueError."""
+    out = number(name, value, "a positive number")
+    if not (0 < out < np.inf or (allow_inf and out == np.inf)):
+        wish = "positive" if allow_inf or out <= 0 else "positive and finite"
+        raise ValueError(f"{name} must be {wish}, got {value!r}")
+    return out
+
+
+def share(name: str, value: Any) -> float:
+    """Return ``value`` as a float between 0 and 1, both excluded, or raise a ValueError."""
+    out = number(name, value)
+    if not 0 < out < 1:
+        raise ValueError(f"{name} must lie in (0, 1), got {value!r}")
+    return out
 
 
 def sample_time(dt: Any) -> float:
     """Return ``dt`` as a float, or raise a ValueError unless it is positive and finite."""
-    if not np.isfinite(dt) or dt <= 0:
+    out = number("dt", dt, "a positive number of seconds")
+    if not 0 < out < np.inf:
         raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
-    return float(dt)
+    return out
 
 
 def positive_vector(name: str, value: Any) -> np.ndarray:
@@ -124,38 +295,70 @@ def positive_vector(name: str, value: Any) -> np.ndarray:
     return vector
 
 
-def psd_matrix(name: str, value: ArrayLike, *, definite: bool = False) -> np.ndarray:
+def psd_matrix(
+    name: str, value: ArrayLike, *, definite: bool = False, stack: bool = True
+) -> np.ndarray:
     """Return a (stack of) symmetric positive (semi)definite matrices, or raise a ValueError.
+
+    Each matrix is judged by itself, and in units in which its diagonal is 1: neither a large
+    matrix beside it nor a signal in a small unit hides what is wrong with it.
 
     Parameters
     ----------
     value : array (..., n, n)
     definite : demand strict positive definiteness.
+    stack : whether there may be more than one.
     """
     matrix = np.asarray(finite_array(name, value))
     if matrix.ndim < 2 or matrix.shape[-1] != matrix.shape[-2] or matrix.shape[-1] == 0:
         raise ValueError(f"{name} must be a square matrix (..., n, n), got shape {matrix.shape}")
+    if not stack and matrix.ndim != 2:
+        raise ValueError(f"{name} must be one matrix, got shape {matrix.shape}")
+    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
+    small = np.abs(diagonal) < UNDERFLOW
+    size = np.sqrt(np.maximum(np.abs(diagonal), UNDERFLOW))
+    lengths = size[..., :, None] * size[..., None, :]
     transposed = np.swapaxes(matrix, -1, -2)
-    scale = float(np.abs(matrix).max(initial=0.0))
-    if np.abs(matrix - transposed).max(initial=0.0) > 1e-9 * max(scale, 1e-300):
+    if (np.abs(matrix - transposed) > SYMMETRIC * np.maximum(lengths, np.abs(matrix))).any():
         raise ValueError(f"{name} must be symmetric, got a matrix that differs from its transpose")
-    matrix = (matrix + transposed) / 2
-    smallest = float(np.linalg.eigvalsh(matrix).min(initial=np.inf))
-    if definite and smallest <= 0:
+    kind = "definite" if definite else "semidefinite"
+    if (diagonal[~small] < 0).any() or (definite and small.any()):
         raise ValueError(
-            f"{name} must be positive definite, got a smallest eigenvalue of {smallest:.3g}"
+            f"{name} must be positive {kind}, got {diagonal.min():.3g} on its diagonal"
         )
-    if smallest < -1e-10 * scale:
+    nothing = small[..., :, None] | small[..., None, :]
+    if (nothing & (np.abs(matrix) > lengths)).any():
         raise ValueError(
-            f"{name} must be positive semidefinite, got a smallest eigenvalue of {smallest:.3g}"
+            f"{name} must be positive {kind}, got a row that is not zero with 0 on its diagonal"
+        )
+    matrix = np.where(nothing, 0.0, matrix / 2 + transposed / 2)
+    smallest = float(np.linalg.eigvalsh(unit_diagonal(matrix)[0]).min(initial=np.inf))
+    least = np.finfo(float).eps * matrix.shape[-1] if definite else -INDEFINITE
+    if not smallest >= least:
+        raise ValueError(
+            f"{name} must be positive {kind}, got a smallest eigenvalue of {smallest:.3g} "
+            "(after scaling its diagonal to 1)"
         )
     return matrix
+
+
+def unit_diagonal(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return D⁻¹MD⁻¹ with a diagonal of ones for M (..., n, n) ⪰ 0, and the diagonal of D.
+
+    A diagonal entry 0 stays 0.
+    """
+    size = np.sqrt(np.diagonal(matrix, axis1=-2, axis2=-1))
+    size = np.where(size > 0, size, 1.0)
+    return matrix / size[..., :, None] / size[..., None, :], size
 
 
 def bounds_pair(
     names: tuple[str, str], lower: ArrayLike | None, upper: ArrayLike | None, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return lower and upper bounds of shape (size,), ±inf where None; refuse crossed ones."""
+    """Return lower and upper bounds of shape (size,), ±inf where None; refuse crossed ones.
+
+    Equal bounds hold a signal where it is.
+    """
     low = np.full(size, -np.inf) if lower is None else finite_array(names[0], lower, allow_inf=True)
     high = np.full(size, np.inf) if upper is None else finite_array(names[1], upper, allow_inf=True)
     out = []
@@ -164,10 +367,16 @@ def bounds_pair(
             raise ValueError(f"{name} must be a number or have shape ({size},), got {bound.shape}")
         out.append(np.broadcast_to(bound, (size,)).copy())
     low, high = out
-    crossed = np.flatnonzero(~(low < high))
+    if (low == np.inf).any() or (high == -np.inf).any():
+        raise ValueError(
+            f"{names[0]} must be below infinity and {names[1]} above minus infinity, "
+            f"got {low} and {high}"
+        )
+    crossed = np.flatnonzero(~(low <= high))
     if crossed.size:
         i = int(crossed[0])
         raise ValueError(
-            f"{names[0]} must lie below {names[1]}, got {low[i]:g} and {high[i]:g} at index {i}"
+            f"{names[0]} must lie below {names[1]} or at it, "
+            f"got {low[i]:g} and {high[i]:g} at index {i}"
         )
     return low, high

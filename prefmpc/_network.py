@@ -11,11 +11,13 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from prefmpc._checks import (
+    choice,
     finite_array,
     instance,
     positive_int,
     positive_vector,
     require_x64,
+    sequence,
     shaped,
 )
 from prefmpc._pytree import Stack
@@ -95,9 +97,14 @@ class StageNetwork(Stack):
 
 def check_scale(scale: ArrayLike, over: str) -> np.ndarray:
     """Return the sizes of the signals, or raise a ValueError."""
-    if over not in get_args(Over):
-        raise ValueError(f"over must be one of {get_args(Over)}, got {over!r}")
+    choice("over", over, get_args(Over))
     return positive_vector("scale", scale)
+
+
+def check_layers(name: str, value: Any) -> list[np.ndarray]:
+    """Return the weights of all layers as arrays, or raise a ValueError."""
+    layers = sequence(name, value, "a sequence of arrays, one a layer")
+    return [np.asarray(finite_array(f"{name}[{i}]", layer)) for i, layer in enumerate(layers)]
 
 
 def check_columns(name: str, columns: int, signals: int, over: str) -> None:
@@ -117,8 +124,10 @@ def drawn_from(
     Raises a ValueError if there is no layer, or a number is not positive.
     """
     require_x64()
-    size = np.asarray(finite_array("scale", scale, ndim=1))
-    sizes = [positive_int(f"widths[{i}]", width) for i, width in enumerate(widths)]
+    size = positive_vector("scale", scale)
+    sizes = [
+        positive_int(f"widths[{i}]", width) for i, width in enumerate(sequence("widths", widths))
+    ]
     if not sizes:
         raise ValueError("widths must name at least one layer, got none")
     n_v = size.size if steps is None else size.size * positive_int("steps", steps)

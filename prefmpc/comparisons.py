@@ -11,11 +11,11 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, positive_int
+from prefmpc._checks import finite_array, flag, function, indices, positive_int
 from prefmpc._files import atomic_write
 from prefmpc._random import generator
-from prefmpc.preferences import Preference
-from prefmpc.trajectories import Trajectory
+from prefmpc.preferences import Preference, asked
+from prefmpc.trajectories import Trajectory, failed
 
 _FORMAT_VERSIONS = (1, 2)  # (x, u, y) alone, and with what is optional
 _OPTIONAL = ("x_r", "u_r", "y_r", "u_before")
@@ -28,7 +28,7 @@ class Comparisons:
     Parameters
     ----------
     trajectories : Trajectory
-        With leading dimension n_t.
+        With leading dimension n_t, all finite: drop closed loops that failed.
     first, second : int array (n,)
         Which trajectories stand in each pair.
     labels : array (n,)
@@ -37,7 +37,8 @@ class Comparisons:
     Raises
     ------
     ValueError
-        If there is no pair, an index points nowhere, or a label lies outside [0, 1].
+        If there is no pair, an index points nowhere, a label lies outside [0, 1], or a trajectory
+        holds NaN.
     """
 
     trajectories: Trajectory
@@ -49,7 +50,7 @@ class Comparisons:
         self, trajectories: Trajectory, first: ArrayLike, second: ArrayLike, labels: ArrayLike
     ) -> None:
         _check_pool(trajectories)
-        labels = np.asarray(finite_array("labels", labels, ndim=1))
+        labels = np.asarray(finite_array("labels", labels, ndim=1, booleans=True))
         if labels.size == 0:
             raise ValueError("labels must hold at least one comparison, got an empty data set")
         if labels.min() < 0 or labels.max() > 1:
@@ -98,22 +99,18 @@ class Comparisons:
             trajectories must then hold some that start alike (see `lqr_pool`).
         """
         _check_pool(trajectories)
+        function("preference", preference, 2)
         size = positive_int("size", size)
         count = len(trajectories)
         if count < 2:
             raise ValueError(f"trajectories must hold at least two to compare, got {count}")
         rng = generator(key)
-        if same_start:
+        if flag("same_start", same_start):
             first, second = _pairs_from_one_start(trajectories, size, rng)
         else:
             first = rng.integers(0, count, size)
             second = (first + rng.integers(1, count, size)) % count
-        labels = np.asarray(preference(trajectories[first], trajectories[second]), dtype=float)
-        if labels.shape != (size,):
-            raise ValueError(
-                f"preference must return one label for each of the {size} pairs, got shape "
-                f"{labels.shape}; a function of single pairs needs one_by_one(...)"
-            )
+        labels = asked("preference", preference, trajectories[first], trajectories[second])
         answered = ~np.isnan(labels)
         if not answered.any():
             raise ValueError(f"preference must answer some pairs, it answered none of {size}")
@@ -146,29 +143,31 @@ class Comparisons:
             P(first is preferred): 1 first, 0 second, 0.5 cannot say.
         y_first, y_second : array (n, N, ny), optional
         """
-        first = Trajectory(x_first, u_first, y_first)
-        second = Trajectory(x_second, u_second, y_second)
+        first = _recorded("first", x_first, u_first, y_first)
+        second = _recorded("second", x_second, u_second, y_second)
         shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(side)] for side in (first, second)]
         if len(first.batch_shape) != 1 or shapes[0] != shapes[1]:
             raise ValueError(
-                "first and second must have equal shapes with one leading dimension, got x "
-                f"{np.shape(first.x)} and {np.shape(second.x)}, u {np.shape(first.u)} and "
-                f"{np.shape(second.u)}, y {np.shape(first.y)} and {np.shape(second.y)}"
+                "first and second must have equal shapes with one leading dimension, got x_first "
+                f"{np.shape(first.x)}, x_second {np.shape(second.x)}, u_first {np.shape(first.u)}, "
+                f"u_second {np.shape(second.u)}, y_first {np.shape(first.y)} and y_second "
+                f"{np.shape(second.y)}"
             )
         n = len(first)
+        answers = finite_array("labels", labels, booleans=True)
+        if answers.shape != (n,):
+            raise ValueError(f"labels must have shape ({n},), one a pair, got {answers.shape}")
         both = jax.tree.map(lambda a, b: np.concatenate([a, b]), first, second)
-        return cls(both, np.arange(n), np.arange(n, 2 * n), labels)
+        return cls(both, np.arange(n), np.arange(n, 2 * n), answers)
 
     def subset(self, index: ArrayLike) -> Comparisons:
         """Return the comparisons chosen by an integer or boolean index, in that order."""
-        chosen = np.asarray(index)
-        n = len(self)
+        chosen, n = indices("index", index), len(self)
         if chosen.dtype == bool:
-            fits = chosen.shape == (n,)
+            fits = chosen.shape == (n,) and bool(chosen.any())
         else:
-            whole = chosen.size == 0 or np.issubdtype(chosen.dtype, np.integer)
-            fits = whole and chosen.ndim == 1 and bool(((chosen >= -n) & (chosen < n)).all())
-            chosen = chosen.astype(int) if fits else chosen
+            inside = (chosen >= -n) & (chosen < n)
+            fits = chosen.ndim == 1 and chosen.size > 0 and bool(inside.all())
         if not fits:
             raise ValueError(f"index must choose among the {n} comparisons, got {chosen}")
         return Comparisons(
@@ -194,7 +193,7 @@ class Comparisons:
         target = Path(path)
         if target.suffix != ".npz":
             raise ValueError(f"path must end in .npz, got {str(path)!r}")
-        with atomic_write(target, overwrite=overwrite) as file:
+        with atomic_write(target, overwrite=flag("overwrite", overwrite)) as file:
             np.savez_compressed(file, **self._stored())
         return target
 
@@ -232,6 +231,14 @@ class Comparisons:
         return cls(trajectories, stored["first"], stored["second"], stored["labels"])
 
 
+def _recorded(side: str, x: ArrayLike, u: ArrayLike, y: ArrayLike | None) -> Trajectory:
+    try:
+        return Trajectory(x, u, y)
+    except ValueError as error:
+        names = f"x_{side}, u_{side} and y_{side}"
+        raise ValueError(f"{names} must make trajectories: {error}") from None
+
+
 def _check_pool(trajectories: Any) -> None:
     if not isinstance(trajectories, Trajectory):
         raise ValueError(
@@ -242,6 +249,11 @@ def _check_pool(trajectories: Any) -> None:
         raise ValueError(
             "trajectories must have one leading dimension (n_t trajectories), "
             f"got batch shape {trajectories.batch_shape}"
+        )
+    if (bad := failed(trajectories)).any():
+        raise ValueError(
+            f"trajectories must be finite, got {int(bad.sum())} of {bad.size} with NaN or infinite "
+            f"values (closed loops that failed?), the first at index {int(np.argmax(bad))}"
         )
 
 
@@ -268,8 +280,8 @@ def _pairs_from_one_start(
 
 
 def _pair_indices(name: str, value: ArrayLike, size: int, count: int) -> np.ndarray:
-    index = np.asarray(value)
-    if index.shape != (size,) or not np.issubdtype(index.dtype, np.integer):
+    index = indices(name, value)
+    if index.shape != (size,) or index.dtype == bool:
         raise ValueError(
             f"{name} must hold {size} whole numbers, one for each label, "
             f"got shape {index.shape} of {index.dtype}"

@@ -19,7 +19,15 @@ from jax.sharding import Mesh
 from jax.typing import ArrayLike
 from scipy.special import ndtri
 
-from prefmpc._checks import finite_array, instance, nonnegative, positive_int, require_x64
+from prefmpc._checks import (
+    finite_array,
+    instance,
+    instances,
+    nonnegative,
+    positive_int,
+    require_x64,
+    share,
+)
 from prefmpc._newton import Entries, Minimum, Problem, build, pair_gaps, solve, solve_shared
 from prefmpc._sharding import check_mesh
 from prefmpc.comparisons import Comparisons
@@ -313,8 +321,7 @@ def new_gaps(
     result: MapResult, first: Any, second: Any, level: float
 ) -> tuple[np.ndarray, tuple[int, ...], float]:
     """Return the moment differences (p, n) of new pairs, their batch shape and (1 − level) / 2."""
-    if not 0 < level < 1:
-        raise ValueError(f"level must lie in (0, 1), got {level}")
+    level = share("level", level)
     instance("first", first, Trajectory)
     instance("second", second, Trajectory)
     shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(side)] for side in (first, second)]
@@ -380,17 +387,16 @@ def _paired(
     comparisons: Comparisons | Sequence[Comparisons],
     priors: WishartPrior | Sequence[WishartPrior],
 ) -> tuple[list[Comparisons], list[WishartPrior]]:
-    data_sets = [comparisons] if isinstance(comparisons, Comparisons) else list(comparisons)
-    beliefs = [priors] if isinstance(priors, WishartPrior) else list(priors)
-    for data in data_sets:
-        instance("comparisons", data, Comparisons)
-    for prior in beliefs:
-        instance("priors", prior, WishartPrior)
-    if not isinstance(priors, WishartPrior) and isinstance(comparisons, Comparisons):
+    one_set, one_prior = isinstance(comparisons, Comparisons), isinstance(priors, WishartPrior)
+    data_sets: list[Any] = (
+        [comparisons] if one_set else instances("comparisons", comparisons, Comparisons)
+    )
+    beliefs: list[Any] = [priors] if one_prior else instances("priors", priors, WishartPrior)
+    if one_set:
         data_sets *= len(beliefs)
-    elif isinstance(priors, WishartPrior):
+    elif one_prior:
         beliefs *= len(data_sets)
-    if not data_sets or len(data_sets) != len(beliefs):
+    if len(data_sets) != len(beliefs):
         raise ValueError(
             "comparisons and priors must be equally many, or one of them a single one, "
             f"got {len(data_sets)} and {len(beliefs)}"

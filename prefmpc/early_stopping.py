@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from prefmpc._checks import instance, nonnegative, positive_int, require_x64, to_numpy
+from prefmpc._checks import flag, instance, nonnegative, positive_int, require_x64, share, to_numpy
 from prefmpc._random import generator
 from prefmpc.comparisons import Comparisons
 from prefmpc.losses import FitError, PairData, cross_entropy, objective, padded_size, pair_data
@@ -133,7 +133,8 @@ def fit_network(
         positive_int("patience", patience),
         positive_int("batch_size", batch_size),
     )
-    rng = generator(key)
+    rng, progress = generator(key), flag("progress", progress)
+    validation_fraction = share("validation_fraction", validation_fraction)
     training, held_out = _split(comparisons, validation, validation_fraction, rng)
     data = pair_data(starts, training, padded_size(len(training)))
     test = pair_data(starts, held_out, padded_size(len(held_out), 128))
@@ -185,7 +186,7 @@ def _split(
     if validation is not None:
         instance("validation", validation, Comparisons)
         return comparisons, validation
-    held = held_out_count(len(comparisons), nonnegative("validation_fraction", fraction))
+    held = held_out_count(len(comparisons), fraction)
     order = rng.permutation(len(comparisons))
     return comparisons.subset(order[held:]), comparisons.subset(order[:held])
 

@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import function, instance, nonnegative, positive_int
+from prefmpc._checks import function, instance, positive_int, real_array, share, single
 from prefmpc.comparisons import Comparisons
 from prefmpc.mpc.solution import Controller, check_state
-from prefmpc.preferences import Preference
+from prefmpc.preferences import Preference, asked, failed_loses
 from prefmpc.systems import System
-from prefmpc.trajectories import Trajectory, from_flat
+from prefmpc.trajectories import Trajectory, failed, from_flat
+
+SAME_START = 1e-9
+"""So far apart two states may be to count as the same, relative to the largest on the way."""
 
 
 def accuracy(model: Callable[[Trajectory], Any], comparisons: Comparisons) -> float:
@@ -27,9 +30,9 @@ def accuracy(model: Callable[[Trajectory], Any], comparisons: Comparisons) -> fl
 
     ``model`` is any function that maps a batch of trajectories (n_t,) to costs (n_t,).
     """
-    function("model", model)
+    function("model", model, 1)
     instance("comparisons", comparisons, Comparisons)
-    costs = np.asarray(model(comparisons.trajectories))
+    costs = np.asarray(real_array("what model returns", model(comparisons.trajectories)))
     count = len(comparisons.trajectories)
     if costs.shape != (count,):
         raise ValueError(f"model must return one cost a trajectory ({count},), got {costs.shape}")
@@ -65,11 +68,11 @@ def regret(
     ------
     ValueError
         If the trajectories do not start in the same states: costs from different x(0) do not
-        compare.
+        compare. If one is not finite: a closed loop that failed has no cost.
     """
-    function("cost", cost)
+    function("cost", cost, 1)
     instance("trajectories", trajectories, Trajectory)
-    values = _costs(cost, trajectories)
+    values = _costs(cost, "trajectories", trajectories)
     if best is None:
         if len(trajectories.batch_shape) < 2:
             raise ValueError(
@@ -80,7 +83,11 @@ def regret(
         return values - values.min(axis=tuple(range(values.ndim - 1)))
     instance("best", best, Trajectory)
     _same_starts("best", best, trajectories)
-    return values - _costs(cost, best)
+    if best.batch_shape != trajectories.batch_shape[-1:]:
+        raise ValueError(
+            f"best must have shape {trajectories.batch_shape[-1:]}, got {best.batch_shape}"
+        )
+    return values - _costs(cost, "best", best)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +117,9 @@ def win_rate(
     """Return how often Π prefers the closed loop of one controller to that of another.
 
     Both orders are asked, and no difference (or no answer) counts half, so that a controller wins
-    against itself in half of the cases whatever Π says about equal ones. The interval is Wilson's.
+    against itself in half of the cases whatever Π says about equal ones. A closed loop that failed
+    (with NaN) loses against one that did not, whatever Π says; two such count half. The interval is
+    Wilson's.
 
     Parameters
     ----------
@@ -122,21 +131,15 @@ def win_rate(
     ValueError
         If the trajectories do not start in the same states, or ``confidence`` is not in (0, 1).
     """
-    function("preference", preference)
+    function("preference", preference, 2)
     for name, value in {"first": first, "second": second}.items():
         instance(name, value, Trajectory)
         if len(value.batch_shape) != 1:
             raise ValueError(f"{name} must have shape (m,), got {value.batch_shape}")
     _same_starts("second", second, first)
-    if not 0 < nonnegative("confidence", confidence) < 1:
-        raise ValueError(f"confidence must lie in (0, 1), got {confidence}")
-    count = len(first)
-    answers = np.array([preference(first, second), preference(second, first)], dtype=np.float64)
-    if answers.shape != (2, count) or ((answers < 0) | (answers > 1)).any():
-        raise ValueError(
-            f"preference must return {count} answers in [0, 1], got shape {answers.shape[1:]}"
-            + (f" with {answers}" if answers.size < 20 else "")
-        )
+    confidence, count = share("confidence", confidence), len(first)
+    orders = (first, second), (second, first)
+    answers = [failed_loses(asked("preference", preference, *pair), *pair) for pair in orders]
     wins, losses = np.nan_to_num(answers, nan=0.5)
     rate = float((wins + 1 - losses).mean() / 2)
     z = NormalDist().inv_cdf((1 + confidence) / 2)
@@ -145,8 +148,13 @@ def win_rate(
     return WinRate(rate, float(max(centre - half, 0)), float(min(centre + half, 1)), count)
 
 
-def _costs(cost: Callable[[Trajectory], Any], trajectories: Trajectory) -> np.ndarray:
-    values = np.asarray(cost(trajectories))
+def _costs(cost: Callable[[Trajectory], Any], name: str, trajectories: Trajectory) -> np.ndarray:
+    if (bad := failed(trajectories)).any():
+        raise ValueError(
+            f"{name} must be finite, got {int(bad.sum())} of {bad.size} with NaN or infinite "
+            "values: closed loops that failed have no cost"
+        )
+    values = np.asarray(real_array("what cost returns", cost(trajectories)))
     if values.shape != trajectories.batch_shape or not np.isfinite(values).all():
         raise ValueError(
             f"cost must return one finite number a trajectory {trajectories.batch_shape}, "
@@ -157,7 +165,13 @@ def _costs(cost: Callable[[Trajectory], Any], trajectories: Trajectory) -> np.nd
 
 def _same_starts(name: str, trajectory: Trajectory, other: Trajectory) -> None:
     a, b = np.asarray(trajectory.x[..., 0, :]), np.asarray(other.x[..., 0, :])
-    if a.shape[-2:] != b.shape[-2:] or not np.allclose(a, b, rtol=1e-9, atol=1e-12):
+    fits = a.shape[-2:] == b.shape[-2:]
+    if fits:
+        # In each state's own unit. A loop that failed may have lost its start.
+        all_states = np.abs(np.asarray(trajectory.x)).reshape(-1, a.shape[-1])
+        size = np.max(all_states, axis=0, initial=0.0, where=np.isfinite(all_states))
+        fits = not (np.abs(a - b) > SAME_START * size).any()
+    if not fits:
         raise ValueError(
             f"{name} must start in the same states as what it is compared with: "
             "costs from different x(0) do not compare"
@@ -192,7 +206,8 @@ def simulate(
         If an MPC controller finds no solution on the way.
     """
     instance("system", system, System)
-    function("controller", controller)
+    single("system", system, "; closed_loops takes stacks")
+    function("controller", controller, 1)
     x0 = np.asarray(check_state(x0, system.nx))
     steps = positive_int("steps", steps)
     starts = x0.reshape(-1, system.nx)
@@ -203,7 +218,7 @@ def simulate(
         if isinstance(controller, Controller):
             controller.reset()  # nothing is carried over from one loop to the next
         for k in range(steps):
-            action = np.asarray(controller(x[i, k]), dtype=np.float64)
+            action = np.asarray(real_array("what controller returns", controller(x[i, k])))
             if action.shape != (system.nu,) or not np.isfinite(action).all():
                 raise ValueError(
                     f"controller must return a finite input of shape ({system.nu},), "

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from prefmpc._checks import instance, nonnegative, require_x64, to_numpy
+from prefmpc._checks import choice, instance, positive, require_x64, to_numpy
 from prefmpc._newton import Entries, loss, loss_and_slopes, second_order
 from prefmpc.comparisons import Comparisons
 from prefmpc.losses import FitError, PairData, padded_size, pair_data
@@ -106,10 +106,8 @@ def fit_global(
     require_x64()
     began = time.perf_counter()
     instance("comparisons", comparisons, Comparisons)
-    if not nonnegative("l2", l2) > 0:
-        raise ValueError(f"l2 must be positive, got {l2}")
-    if solver not in ("barrier", "clarabel"):
-        raise ValueError(f'solver must be "barrier" or "clarabel", got {solver!r}')
+    l2 = positive("l2", l2)
+    choice("solver", solver, ("barrier", "clarabel"))
     nx, nu = comparisons.trajectories.x.shape[-1], comparisons.trajectories.u.shape[-1]
     like = QuadraticCost(np.eye(nx), np.eye(nu))
     if solver == "barrier":

@@ -171,6 +171,7 @@ def mpc_rollout(
     """
     many = controllers(system, cost, constraints, terminal)
     horizon, steps = positive_int("horizon", horizon), positive_int("steps", steps)
+    tol = nonnegative("tol", tol)
     begin, lead = starts(x0, system.nx, many)
     out = _program(horizon, steps, derivative=True)(*many, many.systems, begin, tol)
     x, u, y = (a.reshape(*lead, *a.shape[2:]) for a in (out.x, out.u, out.y))

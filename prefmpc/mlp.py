@@ -10,12 +10,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, nonnegative
+from prefmpc._checks import choice, finite_array, leading_shape, nonnegative
 from prefmpc._network import (
     ACTIVATIONS,
     Over,
     StageNetwork,
     check_columns,
+    check_layers,
     check_scale,
     drawn_from,
 )
@@ -74,18 +75,14 @@ class MLPCost(StageNetwork):
         floor: float = 0.0,
         over: Over = "stage",
     ) -> None:
-        if activation not in get_args(MLPActivation):
-            raise ValueError(
-                f"activation must be one of {get_args(MLPActivation)}, got {activation!r}"
-            )
+        choice("activation", activation, get_args(MLPActivation))
         size = check_scale(scale, over)
-        if not len(W) == len(b) >= 1:
+        weights, offsets = check_layers("W", W), check_layers("b", b)
+        if not len(weights) == len(offsets) >= 1:
             raise ValueError(
                 f"W and b must hold the same number of layers, at least one, "
-                f"got {len(W)} and {len(b)}"
+                f"got {len(weights)} and {len(offsets)}"
             )
-        weights = [np.asarray(finite_array(f"W[{i}]", a)) for i, a in enumerate(W)]
-        offsets = [np.asarray(finite_array(f"b[{i}]", a)) for i, a in enumerate(b)]
         out = np.asarray(finite_array("c", c))
         n_v = weights[0].shape[-1] if weights[0].ndim else 0
         widths = [n_v, *(offset.shape[-1] if offset.ndim else 0 for offset in offsets)]
@@ -153,6 +150,7 @@ class MLPCost(StageNetwork):
         activation, floor : as for the class.
         """
         size, sizes, over, rng = drawn_from(scale, widths, steps, key)
+        shape = leading_shape("shape", shape)
 
         def layer(after: int, before: int) -> np.ndarray:
             return rng.standard_normal((*shape, after, before)) * np.sqrt(2 / (after + before))

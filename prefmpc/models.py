@@ -12,11 +12,14 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import (
     array_module,
+    broadcasts,
     instance,
     nonnegative,
     psd_matrix,
     require_x64,
+    sequence,
     shaped,
+    unit_diagonal,
 )
 from prefmpc._pytree import Stack, bypass_init, constant_like, register_pytree
 from prefmpc.pools import random_weights
@@ -114,6 +117,7 @@ class QuadraticCost(Stack):
         A stack of models needs a leading shape that broadcasts against the trajectories'.
         """
         instance("trajectory", trajectory, Trajectory)
+        broadcasts("trajectory", trajectory.batch_shape, self.batch_shape)
         nx, nu = _size(self.theta_Q), _size(self.theta_R)
         shaped("trajectory.x", trajectory.x, (None, nx), "time, then the model's states")
         shaped("trajectory.u", trajectory.u, (None, nu), "time, then the model's inputs")
@@ -189,17 +193,26 @@ class SumCost:
     linear_in_features = False
 
     def __init__(self, models: Sequence[Any], weights: Sequence[float] | None = None) -> None:
-        if isinstance(models, CostModel) or not len(models):
+        parts = [] if isinstance(models, CostModel) else sequence("models", models)
+        if not parts:
             raise ValueError("models must be a sequence of at least one σ model")
-        for i, model in enumerate(models):
-            if not isinstance(model, CostModel):
-                raise ValueError(f"models[{i}] must be a σ model, got {type(model).__name__}")
-        factors = [1.0] * len(models) if weights is None else list(weights)
-        if len(factors) != len(models):
-            raise ValueError(f"weights must be {len(models)} numbers, got {len(factors)}")
+        for i, model in enumerate(parts):
+            check_model(f"models[{i}]", model)
+        stacks = {model.batch_shape for model in parts if hasattr(model, "batch_shape")}
+        if len(stacks) > 1:
+            raise ValueError(f"models must have the same leading shape, got {sorted(stacks)}")
+        factors = [1.0] * len(parts) if weights is None else sequence("weights", weights)
+        if len(factors) != len(parts):
+            raise ValueError(f"weights must be {len(parts)} numbers, got {len(factors)}")
         values = tuple(nonnegative(f"weights[{i}]", w) for i, w in enumerate(factors))
-        object.__setattr__(self, "models", tuple(models))
+        object.__setattr__(self, "models", tuple(parts))
         object.__setattr__(self, "weights", values)
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """Leading shape of a stack of sums; () for one."""
+        shapes = (m.batch_shape for m in self.models if hasattr(m, "batch_shape"))
+        return tuple(next(shapes, ()))
 
     def __call__(self, trajectory: Trajectory) -> Any:
         """Return σ(T) for every trajectory of a batch, shape (...)."""
@@ -225,6 +238,12 @@ class SumCost:
 
 
 register_pytree(SumCost, static=("weights",))
+
+
+def check_model(name: str, value: Any, wanted: str = "a σ model") -> None:
+    """Raise a ValueError unless ``value`` is a σ model."""
+    if isinstance(value, type) or not isinstance(value, CostModel):
+        raise ValueError(f"{name} must be {wanted}, got {type(value).__name__}")
 
 
 @cache
@@ -263,10 +282,11 @@ def _semidefinite_factor(matrix: np.ndarray) -> np.ndarray:
     try:
         return np.linalg.cholesky(matrix)
     except np.linalg.LinAlgError:
+        if matrix.ndim > 2:  # each by itself: a singular one does not touch the others
+            return np.stack([_semidefinite_factor(one) for one in matrix])
         # A singular matrix has no unique Cholesky factor; the QR of a square root gives one.
-        values, vectors = np.linalg.eigh(matrix)
-        root = np.sqrt(np.clip(values, 0, None))[..., None, :] * vectors
-        upper = np.linalg.qr(np.swapaxes(root, -1, -2), mode="r")
-        lower = np.swapaxes(upper, -1, -2)
-        signs = np.where(np.diagonal(lower, axis1=-2, axis2=-1) < 0, -1.0, 1.0)
-        return lower * signs[..., None, :]
+        scaled, size = unit_diagonal(matrix)
+        values, vectors = np.linalg.eigh(scaled)
+        root = vectors * np.sqrt(np.clip(values, 0, None))
+        lower = np.asarray(np.linalg.qr(root.T, mode="r")).T
+        return size[:, None] * lower * np.where(np.diagonal(lower) < 0, -1.0, 1.0)

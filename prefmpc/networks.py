@@ -10,16 +10,13 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import (
-    finite_array,
-    instance,
-    nonnegative,
-)
+from prefmpc._checks import choice, finite_array, flag, instance, leading_shape, nonnegative
 from prefmpc._network import (
     ACTIVATIONS,
     Over,
     StageNetwork,
     check_columns,
+    check_layers,
     check_scale,
     drawn_from,
 )
@@ -97,24 +94,20 @@ class ICNNCost(StageNetwork):
         bias: bool = True,
         even: bool = False,
     ) -> None:
-        if activation not in get_args(Activation):
-            raise ValueError(
-                f"activation must be one of {get_args(Activation)}, got {activation!r}"
-            )
+        choice("activation", activation, get_args(Activation))
+        bias, even = flag("bias", bias), flag("even", even)
         size = check_scale(scale, over)
-        if not len(V) == len(b) == len(U) + 1 >= 1:
+        given = {"V": V, "b": b, "U": U}
+        layers = {name: check_layers(name, value) for name, value in given.items()}
+        if not len(layers["V"]) == len(layers["b"]) == len(layers["U"]) + 1 >= 1:
             raise ValueError(
                 "V, b and U must hold L, L and L − 1 layers with L ≥ 1, "
-                f"got {len(V)}, {len(b)} and {len(U)}"
+                f"got {len(layers['V'])}, {len(layers['b'])} and {len(layers['U'])}"
             )
-        layers = {
-            "V": [np.asarray(finite_array(f"V[{i}]", a)) for i, a in enumerate(V)],
-            "b": [np.asarray(finite_array(f"b[{i}]", a)) for i, a in enumerate(b)],
-            "U": [np.asarray(finite_array(f"U[{i}]", a)) for i, a in enumerate(U)],
-            "c": [np.asarray(finite_array("c", c))],
-        }
+        layers["c"] = [np.asarray(finite_array("c", c))]
         widths = [layer.shape[-1] if layer.ndim else 0 for layer in layers["b"]]
-        lead, n_v = layers["c"][0].shape[:-1], layers["V"][0].shape[-1]
+        lead = layers["c"][0].shape[:-1]
+        n_v = layers["V"][0].shape[-1] if layers["V"][0].ndim else 0
         wanted: dict[str, list[tuple[int, ...]]] = {
             "V": [(width, n_v) for width in widths],
             "b": [(width,) for width in widths],
@@ -144,8 +137,8 @@ class ICNNCost(StageNetwork):
             "activation": activation,
             "floor": nonnegative("floor", floor),
             "over": over,
-            "bias": bool(bias),
-            "even": bool(even),
+            "bias": bias,
+            "even": even,
         }
         for name, value in values.items():
             object.__setattr__(self, name, value)
@@ -197,6 +190,7 @@ class ICNNCost(StageNetwork):
         activation, floor, bias, even : as for the class.
         """
         size, (n_v, *sizes), over, rng = drawn_from(scale, widths, steps, key)
+        shape, bias = leading_shape("shape", shape), flag("bias", bias)
         V = [rng.standard_normal((*shape, width, n_v)) / np.sqrt(n_v) for width in sizes]
         b = [bias * 0.1 * rng.standard_normal((*shape, width)) for width in sizes]
         U = [

@@ -74,9 +74,9 @@ class NonlinearSystem(System):
     ) -> None:
         nx, nu = positive_int("nx", nx), positive_int("nu", nu)
         dt = sample_time(dt)
-        function("f", f)
+        function("f", f, 2)
         output = _state_itself if g is None else g
-        function("g", output)
+        function("g", output, 1)
         low, high = bounds_pair(("u_min", "u_max"), u_min, u_max, nu)
         x, u = (jax.ShapeDtypeStruct((size,), np.float64) for size in (nx, nu))
         got = _shape_of("f(x, u)", f, x, u)
@@ -107,7 +107,7 @@ class NonlinearSystem(System):
         ``substeps`` Runge–Kutta steps a sample; the error falls with their fourth power. The rest
         as in the constructor.
         """
-        function("f", f)
+        function("f", f, 2)
         dt = sample_time(dt)
         got = _shape_of(
             "f(x, u)",

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from prefmpc._checks import finite_array
+from prefmpc._checks import positive
 from prefmpc.nonlinear import Dynamics, NonlinearSystem
 
 GRAVITY = 9.81
@@ -51,7 +51,8 @@ def kinematic_bicycle(
         If a number is not positive.
     """
     given = {"wheelbase": wheelbase, "steering_rate": steering_rate}
-    _positive({**given, "brake": brake, "throttle": throttle})
+    for name, value in {**given, "brake": brake, "throttle": throttle}.items():
+        positive(name, value)
     flow, output = _bicycle(float(wheelbase))
     return NonlinearSystem.from_continuous(
         flow,
@@ -112,7 +113,8 @@ def cart_pendulum(
     ValueError
         If a number is not positive.
     """
-    _positive({"cart": cart, "bob": bob, "length": length, "force": force})
+    for name, value in {"cart": cart, "bob": bob, "length": length, "force": force}.items():
+        positive(name, value)
     flow = _cart_pendulum(float(cart), float(bob), float(length))
     return NonlinearSystem.from_continuous(
         flow, _position_and_angle, nx=4, nu=1, dt=dt, u_min=-force, u_max=force
@@ -133,9 +135,3 @@ def _cart_pendulum(cart: float, bob: float, length: float) -> Dynamics:
 
 def _position_and_angle(x: Any) -> Any:
     return x[:2]
-
-
-def _positive(values: dict[str, float]) -> None:
-    for name, value in values.items():
-        if not float(np.asarray(finite_array(name, value, ndim=0))) > 0:
-            raise ValueError(f"{name} must be positive, got {value}")

@@ -13,6 +13,8 @@ from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from prefmpc._checks import instance, real_array, sample_time
+
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 """Okabe and Ito's palette, safe for the colour-blind, strongest contrasts first."""
 
@@ -63,11 +65,10 @@ def responses(
     step : bool
         Hold each value until the next sample, as inputs do.
     """
-    if not responses:
-        raise ValueError("responses must hold at least one signal, got none")
+    signals = _named("responses", responses)
+    dt = sample_time(dt)
     ax = ax if ax is not None else plt.subplots(figsize=(6.4, 3.0))[1]
-    for label, values in responses.items():
-        values = np.asarray(values)
+    for label, values in signals.items():
         if values.ndim != 1:
             raise ValueError(f"responses[{label!r}] must have shape (steps,), got {values.shape}")
         time = dt * np.arange(values.size)
@@ -77,9 +78,9 @@ def responses(
             ax.plot(time, values, label=label)
     ax.axhline(0, color="#888888", linewidth=0.8, linestyle="-", zorder=0)
     ax.set(xlabel="time in s", ylabel=ylabel, title=title)
-    if len(responses) > 1:
+    if len(signals) > 1:
         # Above the axes, where it hides no line; the title stands on the left.
-        columns = 1 if sum(map(len, responses)) > 32 else len(responses)
+        columns = 1 if sum(map(len, signals)) > 32 else len(signals)
         ax.legend(loc="lower right", bbox_to_anchor=(1, 1), fontsize="small", ncols=columns)
     return ax
 
@@ -103,12 +104,14 @@ def boxes(
     reference : float, optional
         A horizontal line to compare with.
     """
-    if not values:
-        raise ValueError("values must hold at least one sample, got none")
+    samples = _named("values", values)
+    for label, sample in samples.items():
+        if sample.ndim != 1:
+            raise ValueError(f"values[{label!r}] must have shape (n,), got {sample.shape}")
     ax = ax if ax is not None else plt.subplots(figsize=(6.4, 3.2))[1]
     drawn = ax.boxplot(
-        [np.asarray(v) for v in values.values()],
-        tick_labels=list(values),
+        list(samples.values()),
+        tick_labels=list(samples),
         whis=(5, 95),
         widths=0.55,
         patch_artist=True,
@@ -133,9 +136,10 @@ def heatmaps(matrices: Mapping[str, ArrayLike], names: Sequence[str] = ()) -> Fi
     matrices : mapping of title to array (n, n)
     names : labels of rows and columns.
     """
-    if not matrices:
-        raise ValueError("matrices must hold at least one matrix, got none")
-    arrays = {title: np.asarray(matrix) for title, matrix in matrices.items()}
+    arrays = _named("matrices", matrices)
+    for title, array in arrays.items():
+        if array.ndim != 2 or array.shape[0] != array.shape[1] or not array.size:
+            raise ValueError(f"matrices[{title!r}] must have shape (n, n), got {array.shape}")
     limit = max(float(np.abs(array).max()) for array in arrays.values())
     figure, axes = plt.subplots(1, len(arrays), figsize=(3.1 * len(arrays) + 0.6, 3.0))
     for ax, (title, array) in zip(np.atleast_1d(axes), arrays.items(), strict=True):
@@ -147,6 +151,16 @@ def heatmaps(matrices: Mapping[str, ArrayLike], names: Sequence[str] = ()) -> Fi
         ax.set_yticks(ticks, list(names))
     figure.colorbar(image, ax=np.atleast_1d(axes).tolist(), shrink=0.85)
     return figure
+
+
+def _named(name: str, values: Any) -> dict[str, np.ndarray]:
+    instance(name, values, Mapping)
+    if not values:
+        raise ValueError(f"{name} must hold at least one entry, got none")
+    return {
+        label: np.asarray(real_array(f"{name}[{label!r}]", value))
+        for label, value in values.items()
+    }
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]], caption: str) -> Any:

@@ -7,7 +7,17 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, instance, nonnegative, positive_int, require_x64
+from prefmpc._checks import (
+    finite_array,
+    instance,
+    leading_shape,
+    nonnegative,
+    positive_int,
+    psd_matrix,
+    require_x64,
+    sequence,
+    single,
+)
 from prefmpc._random import generator
 from prefmpc.systems import LinearSystem
 from prefmpc.trajectories import Trajectory, rollout
@@ -33,7 +43,7 @@ def random_weights(
     nx, nu = positive_int("nx", nx), positive_int("nu", nu)
     if not 0 < nonnegative("low", low) < nonnegative("high", high):
         raise ValueError(f"low and high must satisfy 0 < low < high, got {low} and {high}")
-    nonnegative("coupling", coupling)
+    coupling, shape = nonnegative("coupling", coupling), leading_shape("shape", shape)
     rng = generator(key)
 
     def draw(n: int) -> np.ndarray:
@@ -47,8 +57,9 @@ def random_weights(
 def random_states(radius: ArrayLike, *, key: Any, shape: tuple[int, ...] = ()) -> np.ndarray:
     """Draw states ``(*shape, nx)``, each entry uniform in [−radius, radius]; radius is (nx,)."""
     radius = np.asarray(finite_array("radius", radius, ndim=1))
-    if (radius < 0).any():
-        raise ValueError(f"radius must not be negative, got {radius}")
+    if not radius.size or (radius < 0).any():
+        raise ValueError(f"radius must not be negative or empty, got {radius}")
+    shape = leading_shape("shape", shape)
     return generator(key).uniform(-1.0, 1.0, (*shape, radius.size)) * radius
 
 
@@ -88,6 +99,7 @@ def lqr_pool(
         With leading dimension ``size``.
     """
     instance("system", system, LinearSystem)
+    single("system", system)
     size = positive_int("size", size)
     rng = generator(key)
     if (radius is None) == (x0 is None):
@@ -95,15 +107,28 @@ def lqr_pool(
     if weights is None:
         Q, R = random_weights(system.nx, system.nu, key=rng, shape=(size,))
     else:
-        Q = np.asarray(finite_array("weights[0]", weights[0], ndim=3))
-        R = np.asarray(finite_array("weights[1]", weights[1], ndim=3))
-        if len(Q) != size or len(R) != size:
-            raise ValueError(f"weights must hold {size} matrices each, got {len(Q)} and {len(R)}")
+        Q, R = _stacks(weights, size, system)
     if x0 is None:
         starts = random_states(radius, key=rng, shape=(size,))  # type: ignore[arg-type]
+        if starts.shape[-1] != system.nx:
+            raise ValueError(f"radius must have shape ({system.nx},), got {starts.shape[1:]}")
     else:
         starts = finite_array("x0", x0)
         if starts.shape != (size, system.nx):
             raise ValueError(f"x0 must have shape {(size, system.nx)}, got {starts.shape}")
     gains = np.stack([system.lqr(q, r)[0] for q, r in zip(Q, R, strict=True)])
     return rollout(system, starts, gains, steps, saturate=saturate)
+
+
+def _stacks(weights: Any, size: int, system: LinearSystem) -> list[np.ndarray]:
+    """Return Q (size, nx, nx) and R (size, nu, nu), or raise a ValueError."""
+    given = sequence("weights", weights)
+    if len(given) != 2:
+        raise ValueError(f"weights must be (Q, R), got {len(given)} entries")
+    out = []
+    for i, n in enumerate((system.nx, system.nu)):
+        stack = psd_matrix(f"weights[{i}]", given[i], definite=i == 1)
+        if stack.shape != (size, n, n):
+            raise ValueError(f"weights[{i}] must have shape {(size, n, n)}, got {stack.shape}")
+        out.append(stack)
+    return out

@@ -3,6 +3,9 @@
 A preference is any function of two batches of trajectories that returns P(first is preferred) for
 each pair: 1 the first, 0 the second, 0.5 no difference, NaN no answer (such a pair is left out of
 a data set).
+
+A trajectory that holds NaN or infinite values is that of a closed loop that failed. All preferences
+made here like it less than every other one; between two of them there is no difference.
 """
 
 from __future__ import annotations
@@ -14,8 +17,16 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import function, nonnegative, psd_matrix
-from prefmpc.trajectories import Trajectory, max_input, phi, settling_time
+from prefmpc._checks import (
+    choice,
+    function,
+    instance,
+    nonnegative,
+    positive,
+    psd_matrix,
+    real_array,
+)
+from prefmpc.trajectories import Trajectory, failed, max_input, phi, settling_time
 
 Preference = Callable[[Trajectory, Trajectory], Any]
 """Π: two batches of trajectories → P(first is preferred) ∈ [0, 1], one number for each pair."""
@@ -27,7 +38,8 @@ Criterion = Callable[[Trajectory], Any]
 class QuadraticPreference:
     """Π_φ: prefers the trajectory with the smaller φ_N(T; Q, R); equal ones give 1.
 
-    Implements eq. (9) of arXiv 2511.22502.
+    Implements eq. (9) of arXiv 2511.22502. A trajectory that is not finite loses against every
+    one that is; two such give 0.5.
 
     Parameters
     ----------
@@ -37,20 +49,22 @@ class QuadraticPreference:
     """
 
     def __init__(self, Q: ArrayLike, R: ArrayLike) -> None:
-        self.Q = psd_matrix("Q", Q)
-        self.R = psd_matrix("R", R)
+        self.Q = psd_matrix("Q", Q, stack=False)
+        self.R = psd_matrix("R", R, stack=False)
 
     def __call__(self, first: Trajectory, second: Trajectory) -> np.ndarray:
         """Return 1.0 where φ(first) ≤ φ(second), else 0.0; shape (...)."""
-        better = phi(first, self.Q, self.R) <= phi(second, self.Q, self.R)
-        return np.asarray(better, dtype=np.float64)
+        check_sides(first, second)
+        better = np.asarray(phi(first, self.Q, self.R) <= phi(second, self.Q, self.R))
+        return failed_loses(better.astype(np.float64), first, second)
 
 
 class SettlingTimePreference:
     """Π_κ: prefers the trajectory whose output settles first, ‖y‖₂ ≤ ε from then on.
 
     Implements the preference of section III-B of arXiv 2511.22502. A trajectory that never settles
-    loses against every one that does.
+    loses against every one that does, and one that is not finite against every one that is (two
+    such give 0.5, or NaN with ``ties="drop"``).
 
     Parameters
     ----------
@@ -70,20 +84,20 @@ class SettlingTimePreference:
         ties: Literal["half", "drop"] = "half",
     ) -> None:
         self.epsilon = nonnegative("epsilon", epsilon)
-        if tie_break not in ("max_input", None):
-            raise ValueError(f'tie_break must be "max_input" or None, got {tie_break!r}')
-        if ties not in ("half", "drop"):
-            raise ValueError(f'ties must be "half" or "drop", got {ties!r}')
+        choice("tie_break", tie_break, ("max_input", None))
+        choice("ties", ties, ("half", "drop"))
         self.tie_break, self.ties = tie_break, ties
 
     def __call__(self, first: Trajectory, second: Trajectory) -> np.ndarray:
         """Return P(first is preferred) ∈ {0, 0.5, 1}, or NaN for a dropped pair; shape (...)."""
+        check_sides(first, second)
         answer = _smaller(
             settling_time(first, self.epsilon), settling_time(second, self.epsilon), 0.0
         )
         if self.tie_break == "max_input":
             spared = np.asarray(max_input(first) <= max_input(second), dtype=np.float64)
-            return np.where(answer == 0.5, spared, answer)
+            answer = np.where(answer == 0.5, spared, answer)
+        answer = failed_loses(answer, first, second)
         return np.where(answer == 0.5, np.nan, answer) if self.ties == "drop" else answer
 
 
@@ -93,15 +107,18 @@ def by_criterion(criterion: Criterion, tolerance: float = 0.0) -> Preference:
     Parameters
     ----------
     criterion : function of a batch of trajectories (...) to numbers (...)
-        Smaller is better, infinite is worst. For instance `settling_time` or `max_input`.
+        Smaller is better, infinite is worst. For instance `settling_time` or `max_input`. What it
+        says of a trajectory that is not finite does not count: that one is worse than all others.
     tolerance : float
         Differences up to it are not noticed: the answer is 0.5.
     """
-    function("criterion", criterion)
+    function("criterion", criterion, 1)
     tolerance = nonnegative("tolerance", tolerance)
 
     def preference(first: Trajectory, second: Trajectory) -> np.ndarray:
-        return _smaller(_judge(criterion, first), _judge(criterion, second), tolerance)
+        check_sides(first, second)
+        answer = _smaller(_judge(criterion, first), _judge(criterion, second), tolerance)
+        return failed_loses(answer, first, second)
 
     return preference
 
@@ -112,23 +129,24 @@ def lexicographic(*preferences: Preference) -> Preference:
     "Settle first, then effort" is
     ``lexicographic(by_criterion(settling_time), by_criterion(max_input))``.
     The next one is asked about the pairs to which all before it answered 0.5 or NaN; if none
-    decides, the last answer stands.
+    decides, the last answer stands. A trajectory that is not finite loses whatever they say.
     """
     if not preferences:
         raise ValueError("preferences must hold at least one preference, got none")
     for i, preference in enumerate(preferences):
-        function(f"preferences[{i}]", preference)
+        function(f"preferences[{i}]", preference, 2)
 
     def combined(first: Trajectory, second: Trajectory) -> np.ndarray:
+        check_sides(first, second)
         if not first.batch_shape:
-            pair = (jax.tree.map(lambda leaf: leaf[None], side) for side in (first, second))
-            return combined(*pair)[0]
-        answer = np.array(preferences[0](first, second), dtype=np.float64)
-        for preference in preferences[1:]:
+            return combined(*(jax.tree.map(lambda leaf: leaf[None], T) for T in (first, second)))[0]
+        answer = asked("preferences[0]", preferences[0], first, second).copy()
+        for i, preference in enumerate(preferences[1:], 1):
             undecided = np.nonzero((answer == 0.5) | np.isnan(answer))
             if undecided[0].size:
-                answer[undecided] = preference(first[undecided], second[undecided])
-        return answer
+                pair = first[undecided], second[undecided]
+                answer[undecided] = asked(f"preferences[{i}]", preference, *pair)
+        return failed_loses(answer, first, second)
 
     return combined
 
@@ -137,14 +155,17 @@ def erring(preference: Preference, rate: float) -> Preference:
     """Return the preference of somebody who gives the wrong answer with probability ``rate``.
 
     The result is a probability: P becomes (1 − rate)·P + rate·(1 − P). `Comparisons.sampled`
-    turns probabilities into answers.
+    turns probabilities into answers. The right answer between one trajectory that is finite and
+    one that is not is the finite one.
     """
-    function("preference", preference)
-    if not nonnegative("rate", rate) <= 1:
+    function("preference", preference, 2)
+    rate = nonnegative("rate", rate)
+    if rate > 1:
         raise ValueError(f"rate must lie in [0, 1], got {rate}")
 
     def noisy(first: Trajectory, second: Trajectory) -> np.ndarray:
-        answer = np.asarray(preference(first, second), dtype=np.float64)
+        check_sides(first, second)
+        answer = failed_loses(asked("preference", preference, first, second), first, second)
         return (1 - rate) * answer + rate * (1 - answer)
 
     return noisy
@@ -155,17 +176,17 @@ def logistic(criterion: Criterion, scale: float) -> Preference:
 
     P = 1 / (1 + exp((criterion(first) − criterion(second)) / scale)), the response model of
     eq. (4) of arXiv 2511.22502 (Bradley and Terry): at a difference of ``scale`` the better one
-    is chosen with 73 %.
+    is chosen with 73 %. One that is not finite is never chosen, unless both are not: then P = 0.5.
     """
-    function("criterion", criterion)
-    if not nonnegative("scale", scale) > 0:
-        raise ValueError(f"scale must be positive, got {scale}")
+    function("criterion", criterion, 1)
+    scale = positive("scale", scale)
 
     def preference(first: Trajectory, second: Trajectory) -> np.ndarray:
+        check_sides(first, second)
         a, b = _judge(criterion, first), _judge(criterion, second)
         with np.errstate(invalid="ignore", over="ignore"):
             gap = np.where(a == b, 0.0, (a - b) / scale)
-        return 0.5 * (1 - np.tanh(gap / 2))
+        return failed_loses(0.5 * (1 - np.tanh(gap / 2)), first, second)
 
     return preference
 
@@ -173,18 +194,59 @@ def logistic(criterion: Criterion, scale: float) -> Preference:
 def one_by_one(ask: Callable[[Trajectory, Trajectory], float]) -> Preference:
     """Turn a function that judges one pair at a time into a preference over batches.
 
-    For anything that cannot be vectorised: a lookup, a simulation, a question to a person.
+    For anything that cannot be vectorised: a lookup, a simulation, a question to a person. About
+    a trajectory that is not finite nobody is asked: the other one is preferred.
     """
-    function("ask", ask)
+    function("ask", ask, 2)
 
     def preference(first: Trajectory, second: Trajectory) -> np.ndarray:
-        answers = [ask(first[i], second[i]) for i in range(len(first))]
-        try:
-            return np.asarray([float(answer) for answer in answers])
-        except (TypeError, ValueError) as error:
-            raise ValueError(f"ask must return a number for each pair: {error}") from None
+        check_sides(first, second)
+        if len(first.batch_shape) != 1:
+            raise ValueError(f"first must have one leading dimension, got {first.batch_shape}")
+        answers = np.full(len(first), np.nan)
+        for i in np.flatnonzero(~(failed(first) | failed(second))):
+            answer = real_array("what ask returns", ask(first[i], second[i]), booleans=True)
+            if answer.size != 1 or answer < 0 or answer > 1:
+                raise ValueError(f"ask must return a number in [0, 1] for each pair, got {answer}")
+            answers[i] = answer.item()
+        return failed_loses(answers, first, second)
 
     return preference
+
+
+def failed_loses(answers: np.ndarray, first: Trajectory, second: Trajectory) -> np.ndarray:
+    """Return the answers (...) with those about failed closed loops put right.
+
+    1 where only the second one failed, 0 where only the first did, 0.5 where both have.
+    """
+    bad, other = failed(first), failed(second)
+    return np.where(bad | other, 0.5 * (1.0 - bad + other), answers)
+
+
+def check_sides(first: Any, second: Any) -> None:
+    """Raise a ValueError unless both are trajectories with the same leading shape."""
+    for name, value in {"first": first, "second": second}.items():
+        instance(name, value, Trajectory)
+    if first.batch_shape != second.batch_shape:
+        raise ValueError(
+            f"second must have the leading shape of first, {first.batch_shape}, "
+            f"got {second.batch_shape}"
+        )
+
+
+def asked(name: str, preference: Preference, first: Trajectory, second: Trajectory) -> np.ndarray:
+    """Return the answers of a preference, one for each pair, or raise a ValueError."""
+    given = real_array(f"what {name} returns", preference(first, second), booleans=True)
+    answers = np.asarray(given)
+    bad = (answers < 0) | (answers > 1)
+    if answers.shape != first.batch_shape or bad.any():
+        raise ValueError(
+            f"{name} must return one answer in [0, 1] for each pair, shape {first.batch_shape}, "
+            f"got shape {answers.shape}"
+            + (f" with {answers[bad][0]:g}" if bad.any() else "")
+            + "; a function of single pairs needs one_by_one(...)"
+        )
+    return answers
 
 
 def _smaller(a: Any, b: Any, tolerance: float) -> np.ndarray:
@@ -194,7 +256,10 @@ def _smaller(a: Any, b: Any, tolerance: float) -> np.ndarray:
 
 
 def _judge(criterion: Criterion, trajectory: Trajectory) -> np.ndarray:
-    values = np.asarray(criterion(trajectory), dtype=np.float64)
+    given = real_array("what criterion returns", criterion(trajectory))
+    values = np.array(given)
+    if values.shape == trajectory.batch_shape:
+        values = np.where(failed(trajectory), np.inf, values)
     if values.shape != trajectory.batch_shape or np.isnan(values).any():
         raise ValueError(
             f"criterion must return one number a trajectory {trajectory.batch_shape}, "

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, nonnegative, psd_matrix
+from prefmpc._checks import is_whole, positive, positive_vector, psd_matrix, sequence
 
 Structure = Literal["full", "diagonal"] | tuple[np.ndarray, np.ndarray]
 """Which entries of Q and R may differ from zero: by name, or as two masks (see `blocks`)."""
@@ -45,12 +45,9 @@ class WishartPrior:
 
     def __post_init__(self) -> None:
         for name in ("Q", "R"):
-            matrix = psd_matrix(name, getattr(self, name), definite=True)
-            if matrix.ndim != 2:
-                raise ValueError(f"{name} must be one matrix, got shape {matrix.shape}")
-            object.__setattr__(self, name, np.asarray(matrix))
-        if not nonnegative("strength", self.strength) > 0:
-            raise ValueError(f"strength must be positive, got {self.strength}")
+            matrix = psd_matrix(name, getattr(self, name), definite=True, stack=False)
+            object.__setattr__(self, name, matrix)
+        object.__setattr__(self, "strength", positive("strength", self.strength))
 
 
 def bryson(
@@ -69,15 +66,10 @@ def bryson(
     scale, strength : float
         Positive; see `WishartPrior`.
     """
-    if not nonnegative("scale", scale) > 0:
-        raise ValueError(f"scale must be positive, got {scale}")
-    weights = []
-    for name, value in {"x_max": x_max, "u_max": u_max}.items():
-        limit = np.asarray(finite_array(name, value, ndim=1))
-        if limit.size == 0 or (limit <= 0).any():
-            raise ValueError(f"{name} must hold positive deviations, got {limit}")
-        weights.append(np.diag(scale / limit**2))
-    return WishartPrior(weights[0], weights[1], strength)
+    scale = positive("scale", scale)
+    limits = positive_vector("x_max", x_max), positive_vector("u_max", u_max)
+    Q, R = (np.diag(scale / limit**2) for limit in limits)
+    return WishartPrior(Q, R, strength)
 
 
 def blocks(
@@ -97,16 +89,18 @@ def blocks(
     bool array (nx, nx), bool array (nu, nu)
     """
     masks = []
-    for name, groups in {"states": states, "inputs": inputs}.items():
-        flat = [int(i) for group in groups for i in group]
-        if not flat or sorted(flat) != list(range(len(flat))):
+    for name, value in {"states": states, "inputs": inputs}.items():
+        groups = [sequence(f"{name}[{i}]", g) for i, g in enumerate(sequence(name, value))]
+        flat = [i for group in groups for i in group]
+        whole = all(map(is_whole, flat))
+        if not flat or not whole or sorted(flat) != list(range(len(flat))):
             raise ValueError(
                 f"{name} must name each index 0 to {max(len(flat) - 1, 0)} in one group, "
-                f"got {[list(group) for group in groups]}"
+                f"got {groups}"
             )
         mask = np.zeros((len(flat), len(flat)), dtype=bool)
         for group in groups:
-            mask[np.ix_(group, group)] = True
+            mask[np.ix_(np.array(group, int), np.array(group, int))] = True
         masks.append(mask)
     return masks[0], masks[1]
 
@@ -120,7 +114,10 @@ def free_entries(structure: Any, prior: WishartPrior) -> tuple[np.ndarray, np.nd
     if isinstance(structure, str) and structure in ("full", "diagonal"):
         masks = [np.ones((n, n), bool) if structure == "full" else np.eye(n) > 0 for n in sizes]
     elif isinstance(structure, tuple) and len(structure) == 2:
-        masks = [np.asarray(mask) for mask in structure]
+        try:
+            masks = [np.asarray(mask) for mask in structure]
+        except Exception as error:  # whatever the objects' own conversion raises
+            raise ValueError(f"structure must hold two bool masks: {error}") from None
         for name, mask, n in zip("QR", masks, sizes, strict=True):
             good = mask.dtype == bool and mask.shape == (n, n) and (mask == mask.T).all()
             if not good or not mask.diagonal().all():

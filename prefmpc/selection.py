@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from prefmpc._chart import Chart, laplaces
-from prefmpc._checks import instance, positive_int, require_x64
+from prefmpc._checks import choice, instance, instances, positive_int, require_x64
 from prefmpc._newton import build, solve
 from prefmpc.comparisons import Comparisons
 from prefmpc.convex import MapResult, check, fit_map
@@ -84,14 +84,11 @@ def choose_prior(
     """
     require_x64()
     instance("comparisons", comparisons, Comparisons)
-    if isinstance(priors, WishartPrior) or not len(priors):
-        raise ValueError(f"priors must be a sequence of at least one WishartPrior, got {priors!r}")
-    for prior in priors:
-        instance("priors", prior, WishartPrior)
-    if by not in ("evidence", "cross_validation"):
-        raise ValueError(f'by must be "evidence" or "cross_validation", got {by!r}')
+    priors = instances("priors", priors, WishartPrior)
+    choice("by", by, ("evidence", "cross_validation"))
     n = len(comparisons)
-    if by == "cross_validation" and not 2 <= positive_int("folds", folds) <= n:
+    folds = positive_int("folds", folds)
+    if by == "cross_validation" and not 2 <= folds <= n:
         raise ValueError(f"folds must lie between 2 and the {n} comparisons, got {folds}")
     C, entries = check([comparisons], priors, structure, outputs)
     problems = build(comparisons, priors, entries, C, padded_size(n))

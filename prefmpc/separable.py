@@ -8,7 +8,15 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import array_module, finite_array, instance, positive_vector
+from prefmpc._checks import (
+    array_module,
+    broadcasts,
+    finite_array,
+    instance,
+    is_whole,
+    leading_shape,
+    positive_vector,
+)
 from prefmpc._pytree import Stack, constant_like, register_pytree
 from prefmpc.trajectories import Trajectory
 
@@ -66,6 +74,7 @@ class SeparableCost(Stack):
     def __call__(self, trajectory: Trajectory) -> Any:
         """Return σ(T) for every trajectory of a batch, shape (...)."""
         instance("trajectory", trajectory, Trajectory)
+        broadcasts("trajectory", trajectory.batch_shape, self.batch_shape)
         signals = trajectory.x.shape[-1] + trajectory.u.shape[-1]
         if signals != len(self.scale):
             raise ValueError(f"trajectory must have {len(self.scale)} signals, got {signals}")
@@ -86,7 +95,7 @@ class SeparableCost(Stack):
 
     def curve(self, signal: int, values: ArrayLike) -> np.ndarray:
         """Return h_i for values of one signal, in its unit: what a single step of it costs."""
-        if not 0 <= signal < len(self.scale):
+        if not is_whole(signal) or not 0 <= signal < len(self.scale):
             raise ValueError(f"signal must lie in [0, {len(self.scale) - 1}], got {signal}")
         v = np.asarray(finite_array("values", values)) / self.scale[signal]
         absolute, square, fourth = np.moveaxis(np.asarray(self.c)[..., signal], -1, 0)
@@ -99,8 +108,10 @@ class SeparableCost(Stack):
     @classmethod
     def start(cls, scale: ArrayLike, *, shape: tuple[int, ...] = ()) -> SeparableCost:
         """Return small equal weights to start training from; a convex problem needs no restarts."""
-        size = np.asarray(finite_array("scale", scale, ndim=1))
-        return cls(np.full((*shape, len(SHAPES), size.size), 0.01), scale=size)
+        size = positive_vector("scale", scale)
+        return cls(
+            np.full((*leading_shape("shape", shape), len(SHAPES), size.size), 0.01), scale=size
+        )
 
 
 register_pytree(SeparableCost, static=("scale",))

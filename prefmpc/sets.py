@@ -7,7 +7,15 @@ import dataclasses
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import bounds_pair, finite_array, psd_matrix
+from prefmpc._checks import (
+    bounds_pair,
+    finite,
+    finite_array,
+    nonnegative,
+    positive,
+    psd_matrix,
+    shaped,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
@@ -22,11 +30,12 @@ class Polyhedron:
     H : array (m, n)
         One row a half-space, in the units of 1 / z times the unit of h.
     h : array (m,)
+        Rows whose limit is +inf bound nothing and are left out.
 
     Raises
     ------
     ValueError
-        If H or h hold NaN or infinite values, or their shapes do not fit.
+        If H holds NaN or infinite values or h NaN or −inf, or their shapes do not fit.
     """
 
     H: np.ndarray
@@ -34,15 +43,18 @@ class Polyhedron:
 
     def __init__(self, H: ArrayLike, h: ArrayLike) -> None:
         H = np.asarray(finite_array("H", H, ndim=2))
-        h = np.asarray(finite_array("h", h, ndim=1))
+        h = np.asarray(finite_array("h", h, ndim=1, allow_inf=True))
         if H.shape[0] != h.shape[0]:
             raise ValueError(
                 f"H and h must have the same number of rows, got {H.shape} and {h.shape}"
             )
         if H.shape[1] == 0:
             raise ValueError(f"H must have at least one column, got shape {H.shape}")
-        object.__setattr__(self, "H", H)
-        object.__setattr__(self, "h", h)
+        if (h == -np.inf).any():
+            raise ValueError(f"h must be above minus infinity, got {h}")
+        bounds = np.isfinite(h)
+        object.__setattr__(self, "H", H[bounds])
+        object.__setattr__(self, "h", h[bounds])
 
     @property
     def dim(self) -> int:
@@ -51,20 +63,27 @@ class Polyhedron:
 
     @classmethod
     def box(cls, lower: ArrayLike, upper: ArrayLike) -> Polyhedron:
-        """Return {z : lower ≤ z ≤ upper}; infinite entries leave that side open."""
-        low = np.atleast_1d(finite_array("lower", lower, allow_inf=True))
-        low, high = bounds_pair(("lower", "upper"), low, upper, low.shape[-1])
-        eye = np.eye(low.size)
-        H = np.concatenate([eye[np.isfinite(high)], -eye[np.isfinite(low)]])
-        h = np.concatenate([high[np.isfinite(high)], -low[np.isfinite(low)]])
-        return cls(H, h)
+        """Return {z : lower ≤ z ≤ upper} for arrays (n,), one of which may be a number.
+
+        Infinite entries leave that side open, equal ones hold an entry of z where it is.
+        """
+        low, high = (
+            np.asarray(finite_array(name, value, allow_inf=True))
+            for name, value in {"lower": lower, "upper": upper}.items()
+        )
+        size = low.size if low.ndim else high.size
+        low, high = bounds_pair(("lower", "upper"), low, high, size)
+        eye = np.eye(size)
+        return cls(np.concatenate([eye, -eye]), np.concatenate([high, -low]))
 
     def contains(self, z: ArrayLike, tol: float = 1e-9) -> np.ndarray:
-        """Say for each z (..., n) whether H z ≤ h + tol; a bool array (...)."""
-        z = np.asarray(finite_array("z", z))
-        if z.shape[-1:] != (self.dim,):
-            raise ValueError(f"z must have shape (..., {self.dim}), got {z.shape}")
-        return np.asarray((z @ self.H.T <= self.h + tol).all(axis=-1))
+        """Say for each z (..., n) whether H z ≤ h; a bool array (...).
+
+        ``tol`` is relative to the larger of abs(h) and abs(H)·abs(z), whatever the units.
+        """
+        z, tol = _points(z, self.dim), nonnegative("tol", tol)
+        size = np.maximum(np.abs(self.h), np.abs(z) @ np.abs(self.H).T)
+        return np.asarray((z @ self.H.T <= self.h + tol * size).all(axis=-1))
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
@@ -88,13 +107,8 @@ class Ellipsoid:
     level: float
 
     def __init__(self, P: ArrayLike, level: float = 1.0) -> None:
-        matrix = psd_matrix("P", P, definite=True)
-        if matrix.ndim != 2:
-            raise ValueError(f"P must be one matrix, got shape {matrix.shape}")
-        if np.isnan(level) or not level > 0:
-            raise ValueError(f"level must be positive, got {level}")
-        object.__setattr__(self, "P", np.asarray(matrix))
-        object.__setattr__(self, "level", float(level))
+        object.__setattr__(self, "P", psd_matrix("P", P, definite=True, stack=False))
+        object.__setattr__(self, "level", positive("level", level, allow_inf=True))
 
     @property
     def dim(self) -> int:
@@ -103,9 +117,7 @@ class Ellipsoid:
 
     def contains(self, z: ArrayLike, tol: float = 1e-9) -> np.ndarray:
         """Say for each z (..., n) whether zᵀPz ≤ level·(1 + tol); a bool array (...)."""
-        z = np.asarray(finite_array("z", z))
-        if z.shape[-1:] != (self.dim,):
-            raise ValueError(f"z must have shape (..., {self.dim}), got {z.shape}")
+        z, tol = _points(z, self.dim), nonnegative("tol", tol)
         return np.asarray(np.einsum("...i,ij,...j", z, self.P, z) <= self.level * (1 + tol))
 
 
@@ -137,6 +149,8 @@ class SecondOrderCone:
     ) -> None:
         matrix = np.asarray(finite_array("F", F, ndim=2))
         m, n = matrix.shape
+        if not m or not n:
+            raise ValueError(f"F must have at least one row and one column, got {matrix.shape}")
         vectors = {"g": (g, m), "c": (c, n)}
         object.__setattr__(self, "F", matrix)
         for name, (value, size) in vectors.items():
@@ -144,7 +158,7 @@ class SecondOrderCone:
             if vector.shape != (size,):
                 raise ValueError(f"{name} must have shape ({size},), got {vector.shape}")
             object.__setattr__(self, name, vector)
-        object.__setattr__(self, "d", float(finite_array("d", d, ndim=0)))
+        object.__setattr__(self, "d", finite("d", d))
 
     @property
     def dim(self) -> int:
@@ -152,9 +166,16 @@ class SecondOrderCone:
         return int(self.F.shape[1])
 
     def contains(self, z: ArrayLike, tol: float = 1e-9) -> np.ndarray:
-        """Say for each z (..., n) whether ‖F z + g‖₂ ≤ cᵀz + d + tol; a bool array (...)."""
-        z = np.asarray(finite_array("z", z))
-        if z.shape[-1:] != (self.dim,):
-            raise ValueError(f"z must have shape (..., {self.dim}), got {z.shape}")
-        size = np.linalg.norm(z @ self.F.T + self.g, axis=-1)
-        return np.asarray(size <= z @ self.c + self.d + tol)
+        """Say for each z (..., n) whether ‖F z + g‖₂ ≤ cᵀz + d; a bool array (...).
+
+        ``tol`` is relative to the sizes of the terms, whatever the units.
+        """
+        z, tol = _points(z, self.dim), nonnegative("tol", tol)
+        terms = np.abs(z) @ np.abs(self.F).T + np.abs(self.g)
+        size = np.maximum(np.linalg.norm(terms, axis=-1), np.abs(z) @ np.abs(self.c) + abs(self.d))
+        length = np.linalg.norm(z @ self.F.T + self.g, axis=-1)
+        return np.asarray(length <= z @ self.c + self.d + tol * size)
+
+
+def _points(z: ArrayLike, dim: int) -> np.ndarray:
+    return np.asarray(shaped("z", finite_array("z", z), (dim,)))

@@ -9,9 +9,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from prefmpc._checks import array_module, instance
+from prefmpc._checks import array_module, instance, sequence
 from prefmpc._pytree import Stack, bypass_init, register_pytree
-from prefmpc.models import CostModel
+from prefmpc.models import CostModel, check_model
 from prefmpc.trajectories import Trajectory
 
 Name = Literal["x", "y", "du", "dy", "x_r", "u_r", "x0"]
@@ -60,9 +60,9 @@ def select(trajectory: Trajectory, signals: Sequence[Signal]) -> Trajectory:
 
 def check_signals(signals: Sequence[Signal]) -> tuple[Signal, ...]:
     """Return the signals as a tuple, or raise a ValueError."""
-    names = (signals,) if isinstance(signals, str) else tuple(signals)
+    names = (signals,) if isinstance(signals, str) else tuple(sequence("signals", signals))
     known = get_args(Name)
-    if not names or len(set(names)) < len(names) or not {_split(n)[0] for n in names} <= set(known):
+    if not names or not all(_split(n)[0] in known for n in names) or len(set(names)) < len(names):
         raise ValueError(f"signals must name different ones of {known}, got {signals!r}")
     if "x0" in names and len(names) > 1:
         raise ValueError(f'signals must hold "x0" alone or not at all, got {signals!r}')
@@ -139,8 +139,7 @@ class SignalCost(Stack):
     signals: tuple[Signal, ...]
 
     def __init__(self, model: CostModel, signals: Sequence[Signal]) -> None:
-        if not isinstance(model, CostModel):
-            raise ValueError(f"model must be a σ model, got {type(model).__name__}")
+        check_model("model", model)
         object.__setattr__(self, "model", model)
         object.__setattr__(self, "signals", check_signals(signals))
 

@@ -11,7 +11,15 @@ import numpy as np
 import scipy.linalg
 from jax.typing import ArrayLike
 
-from prefmpc._checks import bounds_pair, finite_array, psd_matrix, sample_time
+from prefmpc._checks import (
+    bounds_pair,
+    finite_array,
+    instances,
+    nonnegative,
+    psd_matrix,
+    sample_time,
+    single,
+)
 from prefmpc._pytree import Stack, register_pytree
 
 if TYPE_CHECKING:
@@ -52,7 +60,8 @@ class LinearSystem(System, Stack):
     dt : float
         Sample time in seconds.
     u_min, u_max : array (nu,) or float, optional
-        Input bounds in the unit of the input; None leaves that side open.
+        Input bounds in the unit of the input; None leaves that side open, equal ones lock an
+        actuator.
 
     Raises
     ------
@@ -99,12 +108,9 @@ class LinearSystem(System, Stack):
         For studies of many plants at once: `closed_loops` and `BatchedMPC` take such a stack, and
         ``step`` and ``output`` then take x (c, m, nx) and u (c, m, nu).
         """
-        systems = list(systems)
-        if not systems:
-            raise ValueError("systems must hold at least one LinearSystem, got none")
-        for system in systems:
-            if not isinstance(system, LinearSystem) or system.batch_shape:
-                raise ValueError(f"systems must hold single LinearSystems, got {system!r}")
+        systems = instances("systems", systems, LinearSystem)
+        for i, system in enumerate(systems):
+            single(f"systems[{i}]", system)
         kinds = {(s.A.shape, s.B.shape, s.C.shape, s.dt) for s in systems}
         if len(kinds) > 1:
             raise ValueError(f"systems must agree in all shapes and in dt, got {sorted(kinds)}")
@@ -158,6 +164,8 @@ class LinearSystem(System, Stack):
         block = np.zeros((nx + nu, nx + nu))
         block[:nx, :nx], block[:nx, nx:] = a, b
         held = scipy.linalg.expm(block * dt)
+        if not np.isfinite(held).all():
+            raise ValueError(f"dt must be short enough for A and B: the plant overflows in {dt} s")
         return cls(held[:nx, :nx], held[:nx, nx:], c, dt=dt, u_min=u_min, u_max=u_max)
 
     @classmethod
@@ -174,6 +182,11 @@ class LinearSystem(System, Stack):
         A discrete one keeps its own sample time; a continuous one is discretised by zero-order
         hold with ``dt`` in seconds. A feed-through D ≠ 0 is refused: outputs are y = C x here.
         """
+        if not all(hasattr(system, name) for name in ("A", "B", "C", "D", "dt")):
+            raise ValueError(
+                f"system must be a python-control StateSpace, got {type(system).__name__}; "
+                "control.ss(...) makes one of a transfer function"
+            )
         if np.any(np.asarray(system.D)):
             raise ValueError(f"system must have D = 0 (the output is y = C x), got D = {system.D}")
         if system.isctime(strict=True) or system.dt == 0:
@@ -186,7 +199,7 @@ class LinearSystem(System, Stack):
         own = None if unknown else float(system.dt)
         if own is None and dt is None:
             raise ValueError(f"dt must be given: the system's own sample time is {system.dt!r}")
-        if own is not None and dt is not None and not np.isclose(own, dt):
+        if own is not None and dt is not None and not np.isclose(own, sample_time(dt), atol=0):
             raise ValueError(f"dt must equal the system's own sample time {own}, got {dt}")
         chosen = own if own is not None else dt
         assert chosen is not None
@@ -297,6 +310,7 @@ def oscillating_masses(
     if k.shape not in ((), (n + 1,)) or (k < 0).any():
         raise ValueError(f"stiffness must be one or {n + 1} nonnegative numbers in N/m, got {k}")
     k = np.broadcast_to(k, (n + 1,))
+    u_max = nonnegative("u_max", u_max, allow_inf=True)
     springs = np.diag(k[:-1] + k[1:]) - np.diag(k[1:-1], 1) - np.diag(k[1:-1], -1)
     A = np.block([[np.zeros((n, n)), np.eye(n)], [-springs / m[:, None], np.zeros((n, n))]])
     B = np.zeros((2 * n, 2))

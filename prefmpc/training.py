@@ -13,7 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from prefmpc._checks import instance, nonnegative, positive_int, require_x64, to_numpy
+from prefmpc._checks import (
+    choice,
+    instance,
+    nonnegative,
+    positive_int,
+    require_x64,
+    share,
+    to_numpy,
+)
 from prefmpc._lbfgsb import minimise
 from prefmpc._random import generator
 from prefmpc.comparisons import Comparisons
@@ -26,7 +34,7 @@ from prefmpc.losses import (
     padded_size,
     pair_data,
 )
-from prefmpc.models import CostModel, QuadraticCost
+from prefmpc.models import CostModel, QuadraticCost, check_model
 
 Selection = Literal["validation", "training_loss", "leaky_test_accuracy"]
 Status = Literal["converged", "max_iterations", "out_of_bounds", "not_finite"]
@@ -295,10 +303,9 @@ def _scores(models: Any, comparisons: Comparisons, kind: str) -> np.ndarray:
 def _starts(
     comparisons: Comparisons, initial: CostModel | None, restarts: int, key: Any
 ) -> CostModel:
-    trajectories = comparisons.trajectories
+    trajectories, restarts = comparisons.trajectories, positive_int("restarts", restarts)
     if initial is None:
         nx, nu = trajectories.x.shape[-1], trajectories.u.shape[-1]
-        restarts = positive_int("restarts", restarts)
         return QuadraticCost.random(nx, nu, key=key, shape=(restarts,))
     return check_starts(comparisons, initial)
 
@@ -307,8 +314,7 @@ def check_starts(comparisons: Comparisons, initial: Any) -> CostModel:
     """Return the starts, stacked along one leading axis, or raise a ValueError."""
     if isinstance(initial, QuadraticCost) and not initial.batch_shape:
         initial = jax.tree.map(lambda leaf: leaf[None], initial)
-    if not isinstance(initial, CostModel):
-        raise ValueError(f"initial must be a stack of σ models, got {type(initial).__name__}")
+    check_model("initial", initial, "a stack of σ models")
     # The weights of a single network may all have the same first dimension.
     if any(getattr(m, "batch_shape", None) == () for m in getattr(initial, "models", (initial,))):
         raise ValueError("initial must be stacked along one leading axis, got a single model")
@@ -316,14 +322,15 @@ def check_starts(comparisons: Comparisons, initial: Any) -> CostModel:
     if len(sizes) != 1 or not all(sizes):
         raise ValueError(f"initial must be stacked along one leading axis, got {sorted(sizes)}")
     one = jax.tree.map(lambda leaf: leaf[0], initial)
-    one(comparisons.trajectories)  # raises a ValueError if the two do not fit
+    try:
+        one(comparisons.trajectories)
+    except ValueError as error:
+        raise ValueError(f"initial must fit the comparisons: {error}") from None
     return initial
 
 
 def held_out_count(n: int, fraction: float, advice: str = "") -> int:
     """Return how many of n pairs are kept out of training: at least one, and not all of them."""
-    if not 0 < fraction < 1:
-        raise ValueError(f"validation_fraction must lie in (0, 1), got {fraction}")
     count = max(1, round(fraction * n))
     if count >= n:
         raise ValueError(
@@ -339,8 +346,8 @@ def _check_options(
     instance("comparisons", comparisons, Comparisons)
     if test is not None:
         instance("test", test, Comparisons)
-    if selection not in get_args(Selection):
-        raise ValueError(f"selection must be one of {get_args(Selection)}, got {selection!r}")
+    choice("selection", selection, get_args(Selection))
+    fraction = share("validation_fraction", fraction)
     if (test is None) == (selection == "leaky_test_accuracy"):
         raise ValueError(
             'test must be given with selection="leaky_test_accuracy" and only then, '

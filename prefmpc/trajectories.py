@@ -14,12 +14,16 @@ from jax.typing import ArrayLike
 from prefmpc._checks import (
     array_module,
     finite_array,
+    flag,
+    function,
     instance,
     is_traced,
     nonnegative,
     positive_int,
     psd_matrix,
+    real_array,
     shaped,
+    single,
     to_numpy,
 )
 from prefmpc._pytree import Stack, bypass_init, register_pytree
@@ -76,6 +80,9 @@ class Trajectory(Stack):
         horizon = inputs.shape[-2]
         if horizon < 1:
             raise ValueError(f"u must hold at least one step, got shape {inputs.shape}")
+        for name, array in {"x": states, "u": inputs}.items():
+            if not array.shape[-1]:
+                raise ValueError(f"{name} must have at least one channel, got {array.shape}")
         if states.shape[-2] != horizon + 1:
             raise ValueError(
                 f"x must hold one step more than u (x_0 … x_N against u_0 … u_{{N−1}}), "
@@ -135,6 +142,12 @@ class Trajectory(Stack):
 register_pytree(Trajectory)
 
 
+def failed(trajectory: Trajectory) -> np.ndarray:
+    """Say which trajectories (...) hold NaN or infinite values: closed loops that failed."""
+    parts = (trajectory.x, trajectory.u, trajectory.y)
+    return ~np.all([np.isfinite(np.asarray(part)).all((-2, -1)) for part in parts], axis=0)
+
+
 def _reference(name: str, value: ArrayLike, signal: Any) -> Any:
     wanted = (*signal.shape[:-2], signal.shape[-1])
     array = finite_array(name, value)
@@ -171,7 +184,7 @@ def phi(trajectory: Trajectory, Q: ArrayLike, R: ArrayLike) -> Any:
     """
     instance("trajectory", trajectory, Trajectory)
     trajectory = trajectory.deviation()
-    Q, R = psd_matrix("Q", Q), psd_matrix("R", R)
+    Q, R = psd_matrix("Q", Q, stack=False), psd_matrix("R", R, stack=False)
     shaped("Q", Q, (trajectory.x.shape[-1],) * 2, "the trajectory's states")
     shaped("R", R, (trajectory.u.shape[-1],) * 2, "the trajectory's inputs")
     x, u = trajectory.x[..., :-1, :], trajectory.u
@@ -200,10 +213,11 @@ def settling_time(trajectory: Trajectory | ArrayLike, epsilon: float = 0.1) -> n
     if isinstance(trajectory, Trajectory):
         y = np.asarray(trajectory.y)
     else:
-        y = np.asarray(shaped("outputs", finite_array("outputs", trajectory), (None, None)))
+        outputs = finite_array("trajectory", trajectory)
+        y = np.asarray(shaped("trajectory", outputs, (None, None), "outputs over time"))
     steps = y.shape[-2]
-    if steps < 1:
-        raise ValueError(f"outputs must hold at least one step, got shape {y.shape}")
+    if steps < 1 or not y.shape[-1]:
+        raise ValueError(f"trajectory must hold at least one step and output, got {y.shape}")
     with np.errstate(over="ignore"):  # an infinite norm is outside
         outside = ~(np.linalg.norm(y, axis=-1) <= nonnegative("epsilon", epsilon))
     since = np.argmax(outside[..., ::-1], axis=-1)  # steps since it was last outside
@@ -213,8 +227,7 @@ def settling_time(trajectory: Trajectory | ArrayLike, epsilon: float = 0.1) -> n
 
 def settling_text(kappa: ArrayLike, steps: int) -> str:
     """Return a settling time in steps as text: "7", "6.5", or ">30" if it never settled."""
-    if np.ndim(kappa) or np.isnan(value := float(finite_array("kappa", kappa, allow_inf=True))):
-        raise ValueError(f"kappa must be one settling time, got {kappa!r}")
+    value = nonnegative("kappa", kappa, allow_inf=True)
     steps = positive_int("steps", steps)
     return f">{steps}" if np.isinf(value) else f"{value:g}"
 
@@ -254,19 +267,21 @@ def rollout(
         the numbers.
     """
     instance("system", system, System)
+    single("system", system, "; closed_loops takes stacks")
     starts = shaped("x0", finite_array("x0", x0), (system.nx,), "the system's states")
     steps = positive_int("steps", steps)
     batch = starts.shape[:-1]
     flat = starts.reshape(-1, system.nx)
     if callable(law):
-        x, u = _rollout_law(system, flat, steps, law, bool(saturate))
+        function("law", law, 1)
+        x, u = _rollout_law(system, flat, steps, law, flag("saturate", saturate))
     else:
         K = shaped("law", finite_array("law", law), (system.nu, system.nx), "a gain K")
         if K.shape[:-2] not in ((), batch):
             raise ValueError(f"law must hold one gain or one for each x0 {batch}, got {K.shape}")
         gains = array_module(K).broadcast_to(K, (*batch, system.nu, system.nx))
         gains = gains.reshape(-1, system.nu, system.nx)
-        x, u = _rollout_gain(system, flat, steps, gains, bool(saturate))
+        x, u = _rollout_gain(system, flat, steps, gains, flag("saturate", saturate))
     x, u = to_numpy((x, u))
     if not isinstance(system, LinearSystem) and not is_traced(x):
         check_finite_states(x)
@@ -297,9 +312,9 @@ def _scan(
     system: System, x0: Any, steps: int, law: Callable[[Any], Any], saturate: bool
 ) -> tuple[Any, Any]:
     def step(x: Any, _: None) -> tuple[Any, tuple[Any, Any]]:
-        u = law(x)
-        if jnp.shape(u) != (system.nu,):
-            raise ValueError(f"law must return shape ({system.nu},), got {jnp.shape(u)}")
+        u = real_array("what law returns", law(x))
+        if u.shape != (system.nu,):
+            raise ValueError(f"law must return shape ({system.nu},), got {u.shape}")
         if saturate:
             u = jnp.clip(u, system.u_min, system.u_max)
         x_next = system.step(x, u)

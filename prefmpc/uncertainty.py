@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from prefmpc._chart import Chart, Laplace, laplaces, minus_log_posterior
-from prefmpc._checks import instance, positive_int, to_numpy
+from prefmpc._checks import instance, is_whole, positive_int, to_numpy
 from prefmpc._random import generator
 from prefmpc.convex import Interval, MapResult, new_gaps, split
 from prefmpc.models import QuadraticCost
@@ -138,7 +138,7 @@ def posterior(result: MapResult, *, draws: int = 1024, key: Any = 0) -> Posterio
     problem = result.problem
     chart = Chart.of(problem)
     mode = laplaces([problem], [result.minimum.w])[0]
-    rng = np.random.default_rng(key) if isinstance(key, int) else generator(key)
+    rng = np.random.default_rng(key) if is_whole(key) and key >= 0 else generator(key)
     p, total = mode.eta.size, WARM_UP + steps
     noise = Noise(
         rng.standard_normal((CHAINS, p)),

@@ -12,6 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from prefmpc import Comparisons, QuadraticPreference, Trajectory
+from prefmpc._pytree import bypass_init
 
 KEY = jax.random.key(2000)
 RNG = np.random.default_rng(0)
@@ -277,6 +278,21 @@ def test_a_pickle_in_a_file_is_never_run(tmp_path, some):
         Comparisons.load(path)
 
 
+def test_a_pool_with_a_failed_loop_is_refused():
+    failed = bypass_init(Trajectory, x=POOL.x, u=POOL.u.copy(), y=POOL.y)
+    failed.u[3, 1] = np.nan
+    words = "trajectories must be finite, got 1 of 6 with NaN .* the first at index 3"
+    with pytest.raises(ValueError, match=words):
+        Comparisons(failed, [0], [1], [1])
+    with pytest.raises(ValueError, match=words):
+        Comparisons.random(failed, PREFERENCE, 2, key=KEY)
+    x, u = np.ones((2, 4, 2)), np.ones((2, 3, 1))
+    with pytest.raises(ValueError, match=r"x_second.*x must be finite"):
+        Comparisons.from_arrays(x, u, np.where(np.arange(4)[:, None] > 2, np.nan, x), u, [1, 1])
+    kept = np.delete(np.arange(6), 3)
+    assert len(Comparisons.random(failed[kept], PREFERENCE, 5, key=KEY)) == 5
+
+
 X, U = np.ones((2, 4, 2)), np.ones((2, 3, 1))
 
 
@@ -293,7 +309,7 @@ def no_answer(first, second):
         (lambda: Comparisons(POOL, [0], [1], [np.nan]), "labels must be finite"),
         (lambda: Comparisons(POOL, [0], [1], [[1]]), "labels must have 1 dimension"),
         (lambda: Comparisons(POOL, [0, 1], [1], [1]), "first must hold 1 whole numbers"),
-        (lambda: Comparisons(POOL, [0], [1.5], [1]), "second must hold 1 whole numbers"),
+        (lambda: Comparisons(POOL, [0], [1.5], [1]), "second must hold whole numbers, got float"),
         (lambda: Comparisons(POOL, [0], [6], [1]), r"second must point.*0 to 5\), got 6 to 6"),
         (lambda: Comparisons(POOL, [-1], [1], [1]), "first must point into the 6"),
         (lambda: Comparisons(POOL.x, [0], [1], [1]), "trajectories must be a Trajectory"),
@@ -302,11 +318,14 @@ def no_answer(first, second):
         (lambda: Comparisons.random(POOL[:1], PREFERENCE, 2, key=KEY), "at least two to compare"),
         (lambda: Comparisons.random(POOL.x, PREFERENCE, 2, key=KEY), "trajectories must be a Traj"),
         (lambda: Comparisons.random(POOL[0], PREFERENCE, 2, key=KEY), "trajectories must have one"),
-        (lambda: Comparisons.random(POOL, lambda a, b: 1, 2, key=KEY), "one label for each of the"),
+        (
+            lambda: Comparisons.random(POOL, lambda a, b: 1, 2, key=KEY),
+            "one answer in .* each pair",
+        ),
         (lambda: Comparisons.random(POOL, no_answer, 2, key=KEY), "it answered none of 2"),
         (
             lambda: Comparisons.random(POOL, lambda a, b: np.full(2, np.inf), 2, key=KEY),
-            "labels must be finite",
+            "preference must return one answer in .* with inf",
         ),
         (
             lambda: Comparisons.random(POOL, PREFERENCE, 2, key=KEY, same_start=True),
@@ -316,9 +335,9 @@ def no_answer(first, second):
         (lambda: Comparisons(POOL, [0], [1], [1]).sampled(key=0), "key must be a single JAX"),
         (lambda: Comparisons.from_arrays(X, U, X[:1], U[:1], [1, 1]), "must have equal shapes"),
         (lambda: Comparisons.from_arrays(X[0], U[0], X[0], U[0], [1]), "one leading dimension"),
-        (lambda: Comparisons.from_arrays(X, U, X, U, [1]), "first must hold 1 whole"),
+        (lambda: Comparisons.from_arrays(X, U, X, U, [1]), r"labels must have shape \(2,\)"),
         (lambda: Comparisons.from_arrays(X * np.nan, U, X, U, [1, 1]), "x must be finite"),
-        (lambda: Comparisons(POOL, [0], [1], [1]).subset([]), "empty"),
+        (lambda: Comparisons(POOL, [0], [1], [1]).subset([]), "index must choose"),
         (lambda: Comparisons(POOL, [0], [1], [1]).subset([5]), "index must"),
         (lambda: Comparisons(POOL, [0], [1], [1]).save("data.csv"), "path must end in .npz"),
     ],

@@ -162,7 +162,7 @@ def network(comparisons=NOISY, initial=STARTS, **options):
         (lambda: network(validation=POOL), "validation must be a Comparisons"),
         (lambda: network(validation_fraction=0), r"validation_fraction must lie in \(0, 1\)"),
         (lambda: network(validation_fraction=1.0), r"validation_fraction must lie in \(0, 1\)"),
-        (lambda: network(validation_fraction=np.nan), "validation_fraction must be finite"),
+        (lambda: network(validation_fraction=np.nan), r"validation_fraction must lie in \(0, 1\)"),
         (lambda: network(NOISY.subset([0])), "comparisons must hold enough pairs to split"),
         (lambda: network(l2=-1), "l2 must be finite and at least 0"),
         (lambda: network(learning_rate=np.inf), "learning_rate must be finite"),

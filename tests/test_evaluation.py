@@ -29,6 +29,7 @@ from prefmpc import (
     simulate,
     win_rate,
 )
+from prefmpc._pytree import bypass_init
 from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
 KEY = jax.random.key(2000)
@@ -236,6 +237,45 @@ SHIFTED = runs([1, 2], start=1)
 APART = jax.tree.map(lambda *leaves: np.stack(leaves), TWO, SHIFTED)
 
 
+def failing(trajectories, *which):
+    """The same trajectories, some with NaN from the first input on."""
+    x, u = trajectories.x.copy(), trajectories.u.copy()
+    x[list(which), 1:], u[list(which)] = np.nan, np.nan
+    return bypass_init(Trajectory, x=x, u=u, y=x[..., :-1, :])
+
+
+def test_a_failed_loop_never_wins():
+    good = runs([1.0, 1, 1, 1])
+    failed = failing(good, 0, 1, 2, 3)
+    for preference in (
+        QuadraticPreference([[1]], [[1]]),
+        lambda a, b: np.zeros(len(a)),  # of somebody who always takes the second
+        lambda a, b: np.full(len(a), np.nan),
+    ):
+        assert win_rate(preference, good, failed).rate == 1
+        assert win_rate(preference, failed, good).rate == 0
+        assert win_rate(preference, failed, failed).rate == 0.5
+    # 1 fails: lost, 2 fail of both: half, the others are equal: half.
+    mixed = win_rate(QuadraticPreference([[1]], [[1]]), failing(good, 0, 1), failing(good, 1))
+    assert mixed.rate == pytest.approx((0 + 0.5 + 0.5 + 0.5) / 4)
+    with pytest.raises(ValueError, match="trajectories must be finite, got 2 of 4 with NaN"):
+        regret(effort, failing(good, 0, 1), good)
+    with pytest.raises(ValueError, match="best must be finite, got 1 of 4"):
+        regret(effort, good, failing(good, 2))
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_same_starts_whatever_the_unit(unit):
+    def scaled(start):
+        T = runs([1.0, 2], start)
+        return Trajectory(unit * T.x, T.u)
+
+    prefers_first = by_criterion(effort)
+    assert win_rate(prefers_first, scaled(1.0), scaled(1.0 + 1e-12)).rate == 0.5
+    with pytest.raises(ValueError, match="second must start in the same states"):
+        win_rate(prefers_first, scaled(1.0), scaled(1.001))
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
@@ -254,8 +294,14 @@ APART = jax.tree.map(lambda *leaves: np.stack(leaves), TWO, SHIFTED)
         (lambda: regret(effort, TWO, runs([1, 2, 3])), "best must start in the same states"),
         (lambda: regret(effort, APART, TWO), "best must start in the same states"),
         (lambda: win_rate("Π", TWO, TWO), "preference must be a function"),
-        (lambda: win_rate(lambda a, b: 1.0, TWO, TWO), r"must return 2 answers in \[0, 1\], got"),
-        (lambda: win_rate(lambda a, b: [7, 7], TWO, TWO), r"must return 2 answers in \[0, 1\]"),
+        (
+            lambda: win_rate(lambda a, b: 1.0, TWO, TWO),
+            r"one answer in \[0, 1\] .*got shape \(\)",
+        ),
+        (
+            lambda: win_rate(lambda a, b: [7, 7], TWO, TWO),
+            r"one answer in \[0, 1\] .*with 7",
+        ),
         (lambda: win_rate(prefers_less, [1, 2], TWO), "first must be a Trajectory, got list"),
         (lambda: win_rate(prefers_less, TWO, None), "second must be a Trajectory, got NoneType"),
         (
@@ -273,7 +319,10 @@ APART = jax.tree.map(lambda *leaves: np.stack(leaves), TWO, SHIFTED)
             lambda: win_rate(prefers_less, TWO, TWO, confidence=0),
             r"confidence must lie in \(0, 1\)",
         ),
-        (lambda: win_rate(prefers_less, TWO, TWO, confidence=-1), "confidence must be finite and"),
+        (
+            lambda: win_rate(prefers_less, TWO, TWO, confidence=-1),
+            r"confidence must lie in \(0, 1\)",
+        ),
         (lambda: win_rate(prefers_less, TWO, TWO, confidence="1"), "confidence must be a number"),
         (lambda: simulate("plant", still, RADIUS, 2), "system must be a System, got str"),
         (lambda: simulate(MASSES, still, RADIUS[:5], 2), r"x0 must have shape \(..., 6\)"),
@@ -282,7 +331,10 @@ APART = jax.tree.map(lambda *leaves: np.stack(leaves), TWO, SHIFTED)
         (lambda: simulate(MASSES, 1.0, RADIUS, 2), "controller must be a function"),
         (lambda: simulate(MASSES, lambda x: x, RADIUS, 2), r"finite input of shape \(2,\)"),
         (lambda: simulate(MASSES, lambda x: [np.nan, 0], RADIUS, 2), "finite input.*at step 0"),
-        (lambda: simulate(MASSES, lambda x: None, RADIUS, 2), "controller must return a finite"),
+        (
+            lambda: simulate(MASSES, lambda x: None, RADIUS, 2),
+            "controller returns must be an array",
+        ),
         (lambda: loops(system=MASSES.A), "system must be a LinearSystem, got ndarray"),
         (lambda: loops(costs=QUADRATIC_Q), "costs? must be a QuadraticCost, got ndarray"),
         (lambda: loops(costs=QuadraticCost(np.eye(2), np.eye(2))), "must weigh 6 states"),

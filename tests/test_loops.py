@@ -267,9 +267,9 @@ THREE = QuadraticCost.random(6, 2, key=KEY, shape=(3,))
         (lambda: mpc_rollout(MASSES, PAPER, RADIUS, horizon=0, steps=1), "horizon must be"),
         (lambda: mpc_rollout(MASSES, PAPER, RADIUS[:3], horizon=1, steps=1), "x0 must have shape"),
         (lambda: mpc_rollout(MASSES, 3, RADIUS, horizon=1, steps=1), "cost must be a Quadratic"),
-        (lambda: LinearSystem.stack([]), "systems must hold at least one"),
+        (lambda: LinearSystem.stack([]), "systems must be a sequence of at least one"),
         (lambda: LinearSystem.stack([MASSES, SCALAR]), "systems must agree in all shapes"),
-        (lambda: LinearSystem.stack([PAIR]), "systems must hold single LinearSystems"),
+        (lambda: LinearSystem.stack([PAIR]), r"systems\[0\] must be a single model, got a stack"),
     ],
 )
 def test_bad_input_is_named(call, words):

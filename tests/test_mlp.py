@@ -163,8 +163,8 @@ ONE = {"W": [np.ones((2, 3))], "b": [np.zeros(2)], "c": np.ones(2)}
     ("call", "words"),
     [
         (lambda: MLPCost(**ONE, scale=SCALE, activation="sine"), "activation must be one of"),
-        (lambda: MLPCost(**ONE, scale=SCALE, over="time"), "over must be one of"),
-        (lambda: MLPCost(**ONE, scale=SCALE, over="peak"), "over must be one of"),
+        (lambda: MLPCost(**ONE, scale=SCALE, over="time"), "over must be .stage. or .trajectory."),
+        (lambda: MLPCost(**ONE, scale=SCALE, over="peak"), "over must be .stage. or .trajectory."),
         (lambda: MLPCost(**ONE, scale=-SCALE), "scale must hold positive numbers"),
         (lambda: MLPCost(**ONE, scale=[1.0, 1]), "columns, the entries of v, got 3"),
         (lambda: MLPCost(**ONE, scale=[1.0, 1], over="trajectory"), "must have a multiple of 2"),

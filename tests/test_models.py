@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from jax.flatten_util import ravel_pytree
 
-from prefmpc import CostModel, QuadraticCost, Trajectory
+from prefmpc import CostModel, QuadraticCost, Trajectory, WishartPrior
 
 KEY = jax.random.key(2000)
 RNG = np.random.default_rng(0)
@@ -49,6 +49,48 @@ def test_weights_survive_the_way_through_theta(n, data):
 def test_singular_weights(Q):
     cost = QuadraticCost(Q, [[1]])
     np.testing.assert_allclose(cost.Q, Q, atol=1e-14 * max(np.abs(Q).max(), 1e-12) * len(Q) ** 2)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        np.diag([1.0, -1.0]),
+        np.diag([1.0, -1e-3]),
+        np.array([[1.0, 2.0], [2.0, 1.0]]),
+        np.array([[0.0, 1e-3], [1e-3, 1.0]]),
+        np.array([[1.0, 1e-6], [0.0, 1.0]]),
+        # Indefinite or not symmetric in the unit of the second signal alone.
+        np.diag([1e12, -1e-3]),
+        np.array([[1e12, 2e3], [2e3, 1e-6]]),
+        np.array([[1e12, 1.0], [1.0 + 1e-3, 1e-6]]),
+    ],
+)
+def test_neither_a_large_matrix_nor_a_large_unit_hides_a_wrong_one(wrong):
+    for given_Q in (wrong, np.stack([1e12 * np.eye(2), wrong]), np.stack([wrong, np.eye(2)])):
+        R = np.ones((*given_Q.shape[:-2], 1, 1))
+        with pytest.raises(ValueError, match=r"Q must be (symmetric|positive semidefinite)"):
+            QuadraticCost(given_Q, R)
+        with pytest.raises(ValueError, match=r"Q must be (symmetric|positive definite)"):
+            WishartPrior(wrong, [[1]])
+
+
+def test_weights_in_units_decades_apart():
+    D = np.diag([1e6, 1e-6])
+    for S in (np.array([[2.0, 1], [1, 2]]), np.ones((2, 2)), np.diag([1.0, 0])):
+        mixed = D @ S @ D
+        cost = QuadraticCost(mixed, [[1.0]])
+        back = np.linalg.solve(D, np.linalg.solve(D, np.asarray(cost.Q)).T)
+        np.testing.assert_allclose(back, S, atol=1e-14)
+    with pytest.raises(ValueError, match="R must be positive definite, got a smallest eigenvalue"):
+        QuadraticCost([[1.0]], D @ np.ones((2, 2)) @ D)
+    QuadraticCost([[1.0]], D @ np.diag([1.0, 2.0]) @ D)
+
+
+def test_a_singular_matrix_leaves_the_others_of_its_stack_alone():
+    stack = np.stack([Q, np.ones((3, 3)), 1e9 * Q])
+    theta = QuadraticCost(stack, np.stack([R] * 3)).theta_Q
+    np.testing.assert_array_equal(theta[0], QuadraticCost(Q, R).theta_Q)
+    np.testing.assert_array_equal(theta[2], QuadraticCost(1e9 * Q, R).theta_Q)
 
 
 def test_theta_is_the_cholesky_factor_row_by_row():
@@ -116,7 +158,7 @@ def test_frozen_and_a_cost_model():
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda: QuadraticCost(-Q, R), "Q must be positive semidefinite, got a smallest eigenv"),
+        (lambda: QuadraticCost(-Q, R), "Q must be positive semidefinite, got .* on its diagonal"),
         (lambda: QuadraticCost(np.diag([1, -1e-6]), R), "Q must be positive semidefinite"),
         (lambda: QuadraticCost(Q + np.eye(3, k=1), R), "Q must be symmetric"),
         (lambda: QuadraticCost(Q * np.nan, R), "Q must be finite"),

@@ -193,7 +193,7 @@ TWO = {"V": [np.ones((2, 3))] * 2, "b": [np.zeros(2)] * 2, "U": [np.ones((2, 2))
             lambda: ICNNCost(**{**ONE, "b": [np.ones(2)]}, scale=SCALE, bias=False),
             r"b\[0\] must be zero for a network without bias",
         ),
-        (lambda: ICNNCost(**ONE, scale=SCALE, over="time"), "over must be one of"),
+        (lambda: ICNNCost(**ONE, scale=SCALE, over="time"), "over must be .stage. or .trajectory."),
         (lambda: ICNNCost(**ONE, scale=-SCALE), "scale must hold positive numbers"),
         (lambda: ICNNCost(**ONE, scale=SCALE, floor=-1), "floor must be finite and at least 0"),
         (lambda: ICNNCost(**{**ONE, "c": -np.ones(2)}, scale=SCALE), "c must not be negative"),

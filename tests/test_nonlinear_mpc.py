@@ -458,7 +458,7 @@ def mpc(cost=SMOOTH, horizon=2, **options):
         (lambda: mpc(MLPCost.random(np.ones(5), key=KEY, steps=3)), "cost must fit.* trajectory.u"),
         (lambda: mpc(MLPCost.random(np.ones(4), key=KEY)), "cost must fit the system"),
         (lambda: mpc(horizon=0), "horizon must be a whole number of at least 1"),
-        (lambda: mpc(solver="magic"), "solver must be one of .*'slsqp', 'ipopt'.* got 'magic'"),
+        (lambda: mpc(solver="magic"), 'solver must be "slsqp" or "ipopt", got .magic'),
         (lambda: mpc(tol=-1), "tol must be finite and at least 0"),
         (lambda: mpc(max_iterations=0), "max_iterations must be a whole number"),
         (lambda: mpc(constraints=COUPLED), "constraints must have dimension 5, got 8"),

@@ -172,7 +172,7 @@ LAYERS = {
         *("priors", "convex", "uncertainty", "selection"),
         *("mpc", "evaluation", "loops", "studies"),
     },
-    "plots": set(),
+    "plots": {"_checks"},
 }
 
 

@@ -72,8 +72,8 @@ def test_heatmaps_share_one_scale_around_zero():
     [
         (lambda: plots.responses({}, 0.1, ylabel="x"), "responses must hold at least one"),
         (lambda: plots.responses({"a": np.ones((2, 2))}, 0.1, ylabel="x"), r"responses\['a'\].*2"),
-        (lambda: plots.boxes({}, ylabel="x"), "values must hold at least one sample"),
-        (lambda: plots.heatmaps({}), "matrices must hold at least one matrix"),
+        (lambda: plots.boxes({}, ylabel="x"), "values must hold at least one entry"),
+        (lambda: plots.heatmaps({}), "matrices must hold at least one entry"),
     ],
 )
 def test_bad_input_is_named(call, words):

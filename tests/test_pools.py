@@ -153,7 +153,7 @@ MASSES = oscillating_masses()
                 radius=np.ones(6),
                 weights=(np.ones((1, 6, 6)), np.ones((1, 2, 2))),
             ),
-            "weights must hold 2 matrices each, got 1 and 1",
+            r"weights\[0\] must have shape \(2, .*got \(1, ",
         ),
         (lambda: lqr_pool("plant", 2, 5, key=KEY, radius=[1]), "system must be a LinearSystem"),
         (lambda: lqr_pool(MASSES, 2, 5, key=KEY), "radius or x0 must be given, and not both"),

@@ -20,6 +20,7 @@ from prefmpc import (
     one_by_one,
     settling_time,
 )
+from prefmpc._pytree import bypass_init
 
 RNG = np.random.default_rng(0)
 POOL = Trajectory(*(RNG.normal(size=(6, *s)) for s in [(4, 2), (3, 1), (3, 5)]))
@@ -207,6 +208,56 @@ def test_both_orders_of_a_pair_give_the_same_person(a, b, scale):
     assert (np.sign(p - 0.5) * np.sign(sure - 0.5) >= 0).all()
 
 
+def broken(trajectories, *, field="x"):
+    """The same trajectories with NaN from the second step on, in the states or in the inputs."""
+    parts = {name: getattr(trajectories, name).copy() for name in ("x", "u", "y")}
+    parts[field][..., 1:, :] = NAN
+    return bypass_init(Trajectory, **parts)
+
+
+LOSES_TO_NONE = {
+    "quadratic": PREFERENCE,
+    "settling": SettlingTimePreference(),
+    "settling alone": SettlingTimePreference(tie_break=None),
+    "criterion": by_criterion(max_input, 1e9),
+    "criterion with NaN": by_criterion(lambda T: T.x.sum((-1, -2))),
+    "lexicographic": lexicographic(by_criterion(max_input, 1e9), lambda a, b: np.zeros(len(a))),
+    "logistic": logistic(lambda T: np.full(T.batch_shape, INF), 1.0),
+    "one by one": one_by_one(lambda a, b: float("nan") if np.isnan(a.x).any() else 0.5),
+}
+
+
+@pytest.mark.parametrize("name", LOSES_TO_NONE)
+@pytest.mark.parametrize("field", ["x", "u", "y"])
+def test_a_failed_loop_is_worse_than_every_other(name, field):
+    preference = LOSES_TO_NONE[name]
+    # The bad ones are as bad as it gets: they never settle, and push hard.
+    bad = Trajectory(1e3 + POOL.x, 1e3 + POOL.u, 1e3 + POOL.y)
+    failed = broken(POOL, field=field)
+    np.testing.assert_array_equal(preference(bad, failed), 1)
+    np.testing.assert_array_equal(preference(failed, bad), 0)
+    np.testing.assert_array_equal(preference(failed, failed), 0.5)
+    if name != "one by one":
+        assert preference(bad[0], failed[0]) == 1
+    np.testing.assert_allclose(erring(preference, 0.1)(bad, failed), 0.9)
+    np.testing.assert_allclose(erring(preference, 0.1)(failed, bad), 0.1)
+
+
+def test_no_answer_about_two_failed_loops_where_ties_are_dropped():
+    failed = broken(POOL)
+    assert np.isnan(SettlingTimePreference(tie_break=None, ties="drop")(failed, failed)).all()
+
+
+def test_nobody_is_asked_about_a_failed_loop():
+    asked = []
+    ask = one_by_one(lambda a, b: asked.append(a) or 1.0)
+    first = Trajectory(*(np.concatenate([leaf[:2], leaf[:2]]) for leaf in (POOL.x, POOL.u, POOL.y)))
+    second = bypass_init(Trajectory, x=first.x.copy(), u=first.u, y=first.y)
+    second.x[1] = NAN
+    np.testing.assert_array_equal(ask(first, second), 1)
+    assert len(asked) == 3
+
+
 def constant(value):
     return lambda T: np.full(T.batch_shape, value)
 
@@ -218,13 +269,16 @@ def constant(value):
         (lambda: QuadraticPreference(Q, [[np.nan]]), "R must be finite"),
         (lambda: QuadraticPreference(np.eye(3), R)(POOL, POOL), r"Q must have shape \(..., 2, 2\)"),
         (lambda: one_by_one("ask"), "ask must be a function"),
-        (lambda: one_by_one(lambda a, b: "left")(POOL, POOL), "ask must return a number"),
+        (
+            lambda: one_by_one(lambda a, b: "left")(POOL, POOL),
+            "ask returns must be an array",
+        ),
         (lambda: SettlingTimePreference(-0.1), "epsilon must be finite and at least 0, got -0.1"),
         (lambda: SettlingTimePreference(NAN), "epsilon must be finite"),
         (lambda: SettlingTimePreference("0.1"), "epsilon must be a number of at least 0"),
         (lambda: SettlingTimePreference(tie_break="u"), 'tie_break must be "max_input" or None'),
         (lambda: SettlingTimePreference(ties="skip"), 'ties must be "half" or "drop", got .skip'),
-        (lambda: SettlingTimePreference()(POOL.y, POOL.y), "trajectory must be a Trajectory"),
+        (lambda: SettlingTimePreference()(POOL.y, POOL.y), "first must be a Trajectory"),
         (lambda: by_criterion(1.0), "criterion must be a function, got 1.0"),
         (lambda: by_criterion(max_input, -1), "tolerance must be finite and at least 0"),
         (lambda: by_criterion(max_input, INF), "tolerance must be finite"),
@@ -239,8 +293,8 @@ def constant(value):
         (lambda: erring(PREFERENCE, NAN), "rate must be finite"),
         (lambda: logistic(None, 1.0), "criterion must be a function"),
         (lambda: logistic(max_input, 0), "scale must be positive, got 0"),
-        (lambda: logistic(max_input, -1), "scale must be finite and at least 0"),
-        (lambda: logistic(max_input, INF), "scale must be finite"),
+        (lambda: logistic(max_input, -1), "scale must be positive, got -1"),
+        (lambda: logistic(max_input, INF), "scale must be positive and finite"),
         (lambda: logistic(constant(NAN), 1)(POOL, POOL), "one number a trajectory.*with NaN"),
     ],
 )

@@ -164,8 +164,8 @@ def sampled(dt, D=0.0):
         (lambda: plant(dt=0.0), "dt must be a positive number of seconds, got 0"),
         (lambda: plant(dt=-0.1), "dt must be a positive.*-0.1"),
         (lambda: plant(dt=NAN), "dt must be a positive.*nan"),
-        (lambda: plant(u_min=1, u_max=-1), "u_min must lie below u_max, got 1 and -1 at index 0"),
-        (lambda: plant(u_min=1, u_max=1), "u_min must lie below u_max"),
+        (lambda: plant(u_min=1, u_max=-1), "u_min must lie below u_max.*got 1 and -1 at index 0"),
+        (lambda: plant(u_min=INF), "u_min must be below infinity"),
         (lambda: plant(u_min=NAN), "u_min must not contain NaN"),
         (lambda: plant(u_max=[1, 2, 3]), r"u_max must be a number or have shape \(1,\)"),
         (lambda: LinearSystem.from_continuous(EYE, ONE, dt=-1), "dt must be a positive"),
@@ -188,10 +188,10 @@ def sampled(dt, D=0.0):
         (lambda: oscillating_masses([1, NAN]), "masses must be finite"),
         (lambda: oscillating_masses(stiffness=-1), "stiffness must be one or 4 nonnegative"),
         (lambda: oscillating_masses(stiffness=[1, 2]), "stiffness must be one or 4 nonnegative"),
-        (lambda: oscillating_masses(u_max=-1), "u_min must lie below u_max"),
+        (lambda: oscillating_masses(u_max=-1), "u_max must be at least 0"),
         (lambda: Polyhedron([[1, 0]], [1, 2]), "same number of rows"),
         (lambda: Polyhedron([[NAN, 0]], [1]), "H must be finite"),
-        (lambda: Polyhedron([[1, 0]], [INF]), "h must be finite"),
+        (lambda: Polyhedron([[1, 0]], [-INF]), "h must be above minus infinity"),
         (lambda: Polyhedron(np.zeros((1, 0)), [1]), "H must have at least one column"),
         (lambda: Polyhedron.box([0, 0], [1, -1]), "lower must lie below upper.*index 1"),
         (lambda: Polyhedron.box([0, 0], [1, 2, 3]), r"upper must be a number or have shape \(2,\)"),
@@ -201,6 +201,24 @@ def sampled(dt, D=0.0):
 def test_bad_input_is_named(call, words):
     with pytest.raises(ValueError, match=words):
         call()
+
+
+def test_equal_bounds_lock_and_infinite_limits_bound_nothing():
+    locked = plant(u_min=0.5, u_max=0.5)
+    np.testing.assert_array_equal(locked.u_min, locked.u_max)
+    assert Polyhedron.box([0, 1], [1, 1]).contains([[0.5, 1], [0.5, 0.9]]).tolist() == [True, False]
+    half = Polyhedron([[1, 0], [0, 1]], [1, INF])
+    np.testing.assert_array_equal(half.H, [[1, 0]])
+    np.testing.assert_array_equal(half.h, [1])
+    assert half.contains([0.5, 1e300])
+    assert Polyhedron([[1, 0]], [INF]).contains([1e9, 0])
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+def test_on_a_limit_in_any_unit(unit):
+    box = Polyhedron(np.eye(2), unit * np.array([1.0, 0.0]))
+    z = unit * np.array([[1 + 1e-12, 0], [1 + 1e-6, 0], [1, 1e-6]])
+    assert box.contains(z).tolist() == [True, False, False]
 
 
 @given(arrays(float, (20, 3), elements=st.floats(-3, 3)))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from prefmpc._checks import instance, nonnegative
+from prefmpc._checks import instance, nonnegative, sequence
 from prefmpc.models import QuadraticCost, SumCost
 from prefmpc.mpc.solution import MPCSolution, check_dimension, infeasible_message, predicted
 from prefmpc.mpc.terminal import stage_constraints
@@ -248,14 +248,15 @@ def stage_limits(
     Raises a ValueError if a set does not fit.
     """
     Z = stage_constraints(system, constraints)
-    for i, cone in enumerate(output_cones):
+    cones = sequence("output_cones", output_cones)
+    for i, cone in enumerate(cones):
         instance(f"output_cones[{i}]", cone, SecondOrderCone)
         check_dimension(f"output_cones[{i}]", cone.dim, system.ny)
     limits = []
     if len(Z.h):
         limits.append(cp.hstack([X, U]) @ Z.H.T <= np.tile(Z.h, (X.shape[0], 1)))
     Y = X @ system.C.T
-    for cone in output_cones:
+    for cone in cones:
         limits.append(cp.norm(Y @ cone.F.T + cone.g, 2, axis=1) <= Y @ cone.c + cone.d)
     return limits
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import instance, positive_int
+from prefmpc._checks import instance, positive_int, single
 from prefmpc.models import QuadraticCost, SumCost
 from prefmpc.mpc._cone import ParametricProgram, expression, mpc_solution, stage_limits
 from prefmpc.mpc.solution import (
@@ -70,6 +70,7 @@ class ConvexMPC(Controller):
 
         cp: Any = cvxpy
         instance("system", system, LinearSystem)
+        single("system", system, "; BatchedMPC takes stacks")
         self.system, self.cost = system, cost
         self.horizon = positive_int("horizon", horizon)
         nx, nu, N = system.nx, system.nu, self.horizon

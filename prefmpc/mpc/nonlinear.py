@@ -10,9 +10,18 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, function, instance, nonnegative, positive_int, shaped
+from prefmpc._checks import (
+    choice,
+    finite_array,
+    function,
+    instance,
+    nonnegative,
+    positive_int,
+    shaped,
+    single,
+)
 from prefmpc._pytree import bypass_init
-from prefmpc.models import CostModel
+from prefmpc.models import CostModel, check_model
 from prefmpc.mpc import _nlp
 from prefmpc.mpc import _shooting as shooting
 from prefmpc.mpc._shooting import Given, Known, Problem
@@ -83,12 +92,10 @@ class NonlinearMPC(Controller):
         max_iterations: int = 200,
     ) -> None:
         instance("system", system, System)
-        if not isinstance(cost, CostModel):
-            raise ValueError(f"cost must be a σ model, got {type(cost).__name__}")
-        if getattr(cost, "batch_shape", ()):
-            raise ValueError(f"cost must be a single model, got a stack {cost.batch_shape}")  # type: ignore[attr-defined]
-        if solver not in get_args(Solver):
-            raise ValueError(f"solver must be one of {get_args(Solver)}, got {solver!r}")
+        check_model("cost", cost)
+        single("system", system)
+        single("cost", cost)
+        choice("solver", solver, get_args(Solver))
         if solver == "ipopt":
             _need_ipopt()
         self.system, self.cost = system, cost
@@ -97,7 +104,7 @@ class NonlinearMPC(Controller):
         self.max_iterations = positive_int("max_iterations", max_iterations)
         self._path = path
         if path is not None:
-            function("path", path)
+            function("path", path, 2)
             _check_path(path, system)
         self._problem = self._sets(constraints, terminal)
         self._rows = shooting.rows(self._problem, path, self.horizon)
@@ -115,7 +122,7 @@ class NonlinearMPC(Controller):
         ball = (end.P, end.level) if isinstance(end, Ellipsoid) else None
         low, high = self.system.u_min, self.system.u_max
         half = (high - low) / 2
-        scale = np.tile(np.where(np.isfinite(half), half, 1.0), self.horizon)
+        scale = np.tile(np.where(np.isfinite(half) & (half > 0), half, 1.0), self.horizon)
         return Problem(self.system, self.cost, stages, last, ball, final, scale)
 
     def _check_cost(self) -> None:

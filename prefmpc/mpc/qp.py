@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 from jax.typing import ArrayLike
 
-from prefmpc._checks import positive_int
+from prefmpc._checks import positive_int, single
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc._cone import TIGHT, ConeProgram, ConeSolution, mpc_solution
 from prefmpc.mpc.solution import (
@@ -72,11 +72,8 @@ class LinearMPC(Controller):
         terminal: Polyhedron | TerminalIngredients | None = None,
     ) -> None:
         check_problem(system, cost)
-        if cost.batch_shape:
-            raise ValueError(
-                f"cost must be a single model, got a stack of shape {cost.batch_shape}; "
-                "BatchedMPC takes stacks"
-            )
+        for name, part in {"system": system, "cost": cost}.items():
+            single(name, part, "; BatchedMPC takes stacks")
         self.system = system
         self.cost = cost
         self.horizon = positive_int("horizon", horizon)

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, instance, nonnegative, shaped
+from prefmpc._checks import finite_array, instance, nonnegative, shaped, single
 from prefmpc.models import QuadraticCost, SumCost
 from prefmpc.mpc._cone import expression, stage_limits
 from prefmpc.mpc.solution import MPCSolution
@@ -69,6 +69,8 @@ class StabilityCheck:
         """Return ℓ̃(x, u) = ℓ(x, u) − ℓ(z_s) + λᵀ(x − A x − B u) for x (m, nx) and u (m, nu)."""
         states = shaped("x", np.asarray(finite_array("x", x, ndim=2)), (self.system.nx,), "states")
         inputs = shaped("u", np.asarray(finite_array("u", u, ndim=2)), (self.system.nu,), "inputs")
+        if len(states) != len(inputs):
+            raise ValueError(f"x and u must be equally many, got {len(states)} and {len(inputs)}")
         after = states @ self.system.A.T + inputs @ self.system.B.T
         stages = Trajectory(np.stack([states, after], axis=1), inputs[:, None])
         return np.asarray(self.cost(stages) - self.stage_cost + (states - after) @ self.multiplier)
@@ -116,6 +118,7 @@ def check_stability(
 
     cp: Any = cvxpy
     instance("system", system, LinearSystem)
+    single("system", system)
     tol = nonnegative("tol", tol)
     nx, nu = system.nx, system.nu
     x, u = cp.Variable((1, nx)), cp.Variable((1, nu))

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, instance, shaped
+from prefmpc._checks import finite_array, flag, instance, sequence, shaped, single
 from prefmpc._pytree import bypass_init
 from prefmpc.mpc._cone import TIGHT, ConeProgram
 from prefmpc.mpc.solution import MPCSolution, check_dimension
@@ -62,11 +62,16 @@ def steady_state(
         which, and names the nearest output.
     """
     instance("system", system, System)
+    single("system", system)
+    nearest = flag("nearest", nearest)
     wanted = np.asarray(shaped("y_r", finite_array("y_r", y_r, ndim=1), (system.ny,)))
     x, u = np.zeros(system.nx), np.clip(np.zeros(system.nu), system.u_min, system.u_max)
     if start is not None:
-        x = np.asarray(shaped("start[0]", finite_array("start[0]", start[0]), (system.nx,)))
-        u = np.asarray(shaped("start[1]", finite_array("start[1]", start[1]), (system.nu,)))
+        given = sequence("start", start)
+        if len(given) != 2:
+            raise ValueError(f"start must be (x, u), got {len(given)} entries")
+        x = np.asarray(shaped("start[0]", finite_array("start[0]", given[0], ndim=1), (system.nx,)))
+        u = np.asarray(shaped("start[1]", finite_array("start[1]", given[1], ndim=1), (system.nu,)))
     Z = stage_constraints(system, constraints)
     found = _search(system, wanted, Z, x, u)
     if found is None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.optimize import linprog
 
-from prefmpc._checks import instance, nonnegative, positive_int
+from prefmpc._checks import instance, nonnegative, positive_int, single
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc.solution import check_dimension, check_problem
 from prefmpc.sets import Ellipsoid, Polyhedron
@@ -111,14 +111,15 @@ def terminal_ingredients(
         the polyhedron is not found within ``max_steps``.
     """
     check_problem(system, cost)
-    if cost.batch_shape:
-        raise ValueError(f"cost must be a single model, got a stack of shape {cost.batch_shape}")
+    single("system", system)
+    single("cost", cost)
     max_steps, tol = positive_int("max_steps", max_steps), nonnegative("tol", tol)
     Z = stage_constraints(system, constraints)
     if (Z.h <= 0).any():
         raise ValueError(
             f"constraints must hold the origin inside: all h > 0, got {Z.h.min():g} in row "
-            f"{int(Z.h.argmin())} (the input bounds come first)"
+            f"{int(Z.h.argmin())} (the input bounds come first; an input that is locked by equal "
+            "ones has no place in B here)"
         )
     K, P = system.lqr(cost.Q, cost.R)
     closed = system.A - system.B @ K

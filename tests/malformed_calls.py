@@ -1,0 +1,360 @@
+"""Valid calls of everything public, whose arguments `test_malformed_inputs` replaces."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import control
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+
+import prefmpc as p
+from prefmpc import plots
+
+KEY = jax.random.key(0)
+RNG = np.random.default_rng(0)
+
+SYSTEM = p.LinearSystem([[1, 0.5], [0, 0.9]], [[0], [1]], dt=0.1, u_min=-1, u_max=1)
+COST = p.QuadraticCost(np.eye(2), [[1.0]])
+POOL = p.Trajectory(RNG.standard_normal((6, 4, 2)), RNG.standard_normal((6, 3, 1)))
+# Two controllers from the same two states.
+LOOPS = p.Trajectory(np.ones((2, 2, 4, 2)), RNG.standard_normal((2, 2, 3, 1)))
+DATA = p.Comparisons(POOL, [0, 1, 2, 3], [1, 2, 3, 4], [1, 0, 0.5, 1])
+LIMITS = p.Polyhedron.box([-5, -5, -1], [5, 5, 1])
+PRIOR = p.WishartPrior(np.eye(2), [[1.0]])
+PERSON = p.QuadraticPreference(np.eye(2), [[1.0]])
+ICNN = p.ICNNCost.random([1.0, 1, 1], key=KEY, widths=(2,), floor=0.1)
+
+
+def linear(x, u):
+    return SYSTEM.A @ x + SYSTEM.B @ u
+
+
+def still(x):
+    return 0.0 * x[..., :1]
+
+
+def half(first, second):
+    return np.full(first.batch_shape, 0.5)
+
+
+CAR = p.NonlinearSystem(linear, nx=2, nu=1, dt=0.1)
+BOUNDS = {"u_min": np.array([-1.0]), "u_max": np.array([1.0])}
+PLANT = {"A": SYSTEM.A, "B": SYSTEM.B, "C": np.eye(2), "dt": 0.1, **BOUNDS}
+LAYERS = {"b": [np.zeros(2)], "c": np.ones(2), "scale": np.ones(3), "over": "stage"}
+DRAWN = {"scale": np.ones(3), "key": KEY, "widths": (2,), "steps": 2, "shape": (2,), "floor": 0.0}
+MPC = {"system": SYSTEM, "cost": COST, "horizon": 3, "constraints": LIMITS}
+LOOP = {
+    **{"system": SYSTEM, "horizon": 3, "constraints": LIMITS, "x0": np.ones((2, 2))},
+    **{"steps": 2, "terminal": None, "tol": 1e-8},
+}
+SHARED = {"structure": "full", "outputs": np.eye(2)}
+NEWTON = {**SHARED, "max_iterations": 50, "tol": 1e-8}
+SIDES = {"first": POOL[:2], "second": POOL[2:4]}
+
+
+@cache
+def valid_calls():
+    """Return name → (function, valid arguments)."""
+    ingredients = p.terminal_ingredients(SYSTEM, COST)
+    found = p.fit_map(DATA, PRIOR)
+    check = p.check_stability(SYSTEM, COST)
+    target = p.steady_state(SYSTEM, [0.0, 0.0])
+    nets = p.MLPCost.random([1.0, 1, 1], key=KEY, widths=(2,), shape=(2,))
+    tracker = p.ReferenceTracker(p.LinearMPC(SYSTEM, COST, 3), [0.0, 0.0])
+    nonlinear = p.NonlinearMPC(SYSTEM, COST, 3)
+    deviations = {"x_r": np.ones(2), "u_r": np.ones(1), "y_r": np.ones(2), "u_before": np.ones(1)}
+    out = {
+        # plants
+        "LinearSystem": (p.LinearSystem, PLANT),
+        "LinearSystem.from_continuous": (p.LinearSystem.from_continuous, PLANT),
+        "LinearSystem.from_control": (
+            p.LinearSystem.from_control,
+            {"system": control.ss(SYSTEM.A, SYSTEM.B, np.eye(2), 0, 0.1), "dt": 0.1, **BOUNDS},
+        ),
+        "LinearSystem.stack": (p.LinearSystem.stack, {"systems": [SYSTEM, SYSTEM]}),
+        "LinearSystem.lqr": (SYSTEM.lqr, {"Q": np.eye(2), "R": np.eye(1)}),
+        "NonlinearSystem": (
+            p.NonlinearSystem,
+            {"f": linear, "g": still, "nx": 2, "nu": 1, "dt": 0.1, **BOUNDS},
+        ),
+        "NonlinearSystem.from_continuous": (
+            p.NonlinearSystem.from_continuous,
+            {"f": linear, "g": still, "nx": 2, "nu": 1, "dt": 0.1, "substeps": 2, **BOUNDS},
+        ),
+        "NonlinearSystem.linearise": (CAR.linearise, {"x": np.zeros(2), "u": np.zeros(1)}),
+        "oscillating_masses": (
+            p.oscillating_masses,
+            {"masses": np.ones(2), "stiffness": np.ones(3), "dt": 0.2, "u_max": 1.0},
+        ),
+        "cart_pendulum": (
+            p.cart_pendulum,
+            {"cart": 1.0, "bob": 0.2, "length": 0.5, "dt": 0.05, "force": 10.0},
+        ),
+        "kinematic_bicycle": (
+            p.kinematic_bicycle,
+            {"wheelbase": 2.7, "dt": 0.2, "steering_rate": 0.4, "brake": 4.0, "throttle": 2.0},
+        ),
+        # sets
+        "Polyhedron": (p.Polyhedron, {"H": np.eye(2), "h": np.ones(2)}),
+        "Polyhedron.box": (p.Polyhedron.box, {"lower": -np.ones(2), "upper": np.ones(2)}),
+        "Polyhedron.contains": (LIMITS.contains, {"z": np.ones(3), "tol": 1e-9}),
+        "Ellipsoid": (p.Ellipsoid, {"P": np.eye(2), "level": 2.0}),
+        "Ellipsoid.contains": (p.Ellipsoid(np.eye(3)).contains, {"z": np.ones(3), "tol": 1e-9}),
+        "SecondOrderCone": (
+            p.SecondOrderCone,
+            {"F": np.eye(2), "d": 1.0, "g": np.ones(2), "c": np.ones(2)},
+        ),
+        "SecondOrderCone.contains": (
+            p.SecondOrderCone(np.eye(3), 1.0).contains,
+            {"z": np.ones(3), "tol": 1e-9},
+        ),
+        # trajectories
+        "Trajectory": (
+            p.Trajectory,
+            {"x": np.ones((4, 2)), "u": np.ones((3, 1)), "y": np.ones((3, 2)), **deviations},
+        ),
+        "second_moments": (p.second_moments, {"trajectory": POOL}),
+        "phi": (p.phi, {"trajectory": POOL, "Q": np.eye(2), "R": np.eye(1)}),
+        "max_input": (p.max_input, {"trajectory": POOL}),
+        "settling_time": (p.settling_time, {"trajectory": POOL, "epsilon": 0.1}),
+        "settling_text": (p.settling_text, {"kappa": 2.0, "steps": 3}),
+        "rollout": (
+            p.rollout,
+            {"system": SYSTEM, "x0": np.ones((3, 2)), "law": np.ones((1, 2)), "steps": 2},
+        ),
+        "random_weights": (
+            p.random_weights,
+            {
+                **{"nx": 2, "nu": 1, "key": KEY, "shape": (2,)},
+                **{"low": 0.1, "high": 10.0, "coupling": 0.1},
+            },
+        ),
+        "random_states": (p.random_states, {"radius": np.ones(2), "key": KEY, "shape": (2,)}),
+        "lqr_pool": (
+            p.lqr_pool,
+            {
+                **{"system": SYSTEM, "size": 2, "steps": 2, "key": KEY, "radius": np.ones(2)},
+                **{"x0": None, "weights": (np.stack([np.eye(2)] * 2), np.ones((2, 1, 1)))},
+            },
+        ),
+        "select": (p.select, {"trajectory": POOL, "signals": ["x", "du"]}),
+        # preferences and comparisons
+        "QuadraticPreference": (p.QuadraticPreference, {"Q": np.eye(2), "R": np.eye(1)}),
+        "QuadraticPreference()": (PERSON, SIDES),
+        "SettlingTimePreference": (
+            p.SettlingTimePreference,
+            {"epsilon": 0.1, "tie_break": "max_input", "ties": "half"},
+        ),
+        "SettlingTimePreference()": (p.SettlingTimePreference(), SIDES),
+        "by_criterion": (
+            lambda criterion, tolerance: p.by_criterion(criterion, tolerance)(*SIDES.values()),
+            {"criterion": p.max_input, "tolerance": 0.1},
+        ),
+        "by_criterion()": (p.by_criterion(p.max_input), SIDES),
+        "lexicographic": (
+            lambda preferences: p.lexicographic(half, preferences)(*SIDES.values()),
+            {"preferences": PERSON},
+        ),
+        "lexicographic()": (p.lexicographic(half, PERSON), SIDES),
+        "erring": (
+            lambda preference, rate: p.erring(preference, rate)(*SIDES.values()),
+            {"preference": PERSON, "rate": 0.1},
+        ),
+        "erring()": (p.erring(PERSON, 0.1), SIDES),
+        "logistic": (
+            lambda criterion, scale: p.logistic(criterion, scale)(*SIDES.values()),
+            {"criterion": p.max_input, "scale": 0.1},
+        ),
+        "logistic()": (p.logistic(p.max_input, 1.0), SIDES),
+        "one_by_one": (lambda ask: p.one_by_one(ask)(*SIDES.values()), {"ask": PERSON}),
+        "one_by_one()": (p.one_by_one(PERSON), SIDES),
+        "Comparisons": (
+            p.Comparisons,
+            {"trajectories": POOL, "first": [0, 1], "second": [1, 2], "labels": np.ones(2)},
+        ),
+        "Comparisons.random": (
+            p.Comparisons.random,
+            {
+                **{"trajectories": POOL, "preference": PERSON, "size": 2, "key": KEY},
+                "same_start": False,
+            },
+        ),
+        "Comparisons.from_arrays": (
+            p.Comparisons.from_arrays,
+            {
+                **{"x_first": np.ones((2, 4, 2)), "u_first": np.ones((2, 3, 1))},
+                **{"x_second": np.ones((2, 4, 2)), "u_second": np.ones((2, 3, 1))},
+                **{"y_first": np.ones((2, 3, 2)), "y_second": np.ones((2, 3, 2))},
+                "labels": np.ones(2),
+            },
+        ),
+        "Comparisons.sampled": (DATA.sampled, {"key": KEY}),
+        "Comparisons.subset": (DATA.subset, {"index": np.array([0, 1])}),
+        "Comparisons.load": (p.Comparisons.load, {"path": "nowhere.npz"}),
+        # models
+        "QuadraticCost": (p.QuadraticCost, {"Q": np.eye(2), "R": np.eye(1)}),
+        "QuadraticCost()": (COST, {"trajectory": POOL}),
+        "QuadraticCost.random": (
+            lambda nx, nu, key, shape: p.QuadraticCost.random(nx, nu, key=key, shape=shape),
+            {"nx": 2, "nu": 1, "key": KEY, "shape": (2,)},
+        ),
+        "SumCost": (p.SumCost, {"models": [COST, ICNN], "weights": [1.0, 2.0]}),
+        "SumCost()": (p.SumCost([COST, ICNN]), {"trajectory": POOL}),
+        "SignalCost": (p.SignalCost, {"model": COST, "signals": ["x"]}),
+        "SignalCost()": (p.SignalCost(COST, "x"), {"trajectory": POOL}),
+        "SeparableCost": (p.SeparableCost, {"c": np.ones((3, 3)), "scale": np.ones(3)}),
+        "SeparableCost()": (p.SeparableCost.start(np.ones(3)), {"trajectory": POOL}),
+        "SeparableCost.start": (p.SeparableCost.start, {"scale": np.ones(3), "shape": (2,)}),
+        "SeparableCost.curve": (
+            p.SeparableCost.start(np.ones(3)).curve,
+            {"signal": 1, "values": np.ones(4)},
+        ),
+        "ICNNCost": (
+            p.ICNNCost,
+            {
+                **{"V": [np.ones((2, 3))], "U": [], **LAYERS, "activation": "relu", "floor": 0.1},
+                **{"bias": True, "even": False},
+            },
+        ),
+        "ICNNCost()": (ICNN, {"trajectory": POOL}),
+        "ICNNCost.random": (
+            p.ICNNCost.random,
+            {**DRAWN, "activation": "relu", "bias": True, "even": False},
+        ),
+        "MLPCost": (
+            p.MLPCost,
+            {"W": [np.ones((2, 3))], **LAYERS, "activation": "relu", "floor": 0.1},
+        ),
+        "MLPCost.random": (p.MLPCost.random, {**DRAWN, "activation": "relu"}),
+        "soft_constraints": (p.soft_constraints, {"constraints": LIMITS, "weight": np.ones(6)}),
+        # learning
+        "WishartPrior": (p.WishartPrior, {"Q": np.eye(2), "R": np.eye(1), "strength": 1.0}),
+        "bryson": (
+            p.bryson,
+            {"x_max": np.ones(2), "u_max": np.ones(1), "scale": 1.0, "strength": 1.0},
+        ),
+        "blocks": (p.blocks, {"states": [[0, 1], [2]], "inputs": [[0]]}),
+        "fit": (
+            p.fit,
+            {
+                **{"comparisons": DATA, "initial": None, "key": KEY, "restarts": 2, "test": None},
+                **{"selection": "training_loss", "validation_fraction": 0.25, "l2": 1e-3},
+                **{"l1": 0.0, "adam_steps": 2, "learning_rate": 0.01, "max_iterations": 2},
+                "tol": 1e9,
+            },
+        ),
+        "fit (initial)": (
+            lambda initial: p.fit(DATA, initial, key=KEY, adam_steps=2, max_iterations=2, tol=1e9),
+            {"initial": p.QuadraticCost.random(2, 1, key=KEY, shape=(2,))},
+        ),
+        "fit_map": (
+            p.fit_map,
+            {"comparisons": DATA, "prior": PRIOR, **NEWTON, "mesh": None},
+        ),
+        "fit_maps": (p.fit_maps, {"comparisons": DATA, "priors": [PRIOR, PRIOR], **NEWTON}),
+        "fit_network": (
+            p.fit_network,
+            {
+                **{"comparisons": DATA, "initial": nets, "key": KEY, "validation": None},
+                **{"validation_fraction": 0.25, "l2": 1e-3, "learning_rate": 0.01},
+                **{"max_epochs": 10, "patience": 1, "batch_size": 64, "progress": False},
+            },
+        ),
+        "fit_global": (p.fit_global, {"comparisons": DATA, "l2": 1e-3, "solver": "barrier"}),
+        "MapResult.probability": (found.probability, {**SIDES, "level": 0.9}),
+        "posterior": (p.posterior, {"result": found, "draws": 256, "key": 0}),
+        "choose_prior": (
+            p.choose_prior,
+            {"comparisons": DATA, "priors": [PRIOR], "by": "evidence", "folds": 2, **SHARED},
+        ),
+        # controllers
+        "LinearMPC": (p.LinearMPC, {**MPC, "terminal": ingredients}),
+        "LinearMPC.solve": (
+            p.LinearMPC(SYSTEM, COST, 3).solve,
+            {"x0": np.ones(2), "reference": target},
+        ),
+        "ConvexMPC": (
+            p.ConvexMPC,
+            {**MPC, "output_cones": [p.SecondOrderCone(np.eye(2), 9.0)], "terminal": check},
+        ),
+        "ConvexMPC.solve": (p.ConvexMPC(SYSTEM, COST, 3).solve, {"x0": np.ones(2)}),
+        "BatchedMPC": (p.BatchedMPC, {**MPC, "terminal": ingredients, "tol": 1e-8}),
+        "BatchedMPC.solve": (p.BatchedMPC(SYSTEM, COST, 3).solve, {"x0": np.ones(2)}),
+        "NonlinearMPC": (
+            p.NonlinearMPC,
+            {
+                **{**MPC, "path": lambda x, u: x[:1] - 9, "terminal": None, "solver": "slsqp"},
+                **{"tol": 1e-4, "max_iterations": 20},
+            },
+        ),
+        "NonlinearMPC.solve": (
+            nonlinear.solve,
+            {
+                **{"x0": np.ones(2), "reference": target, "u_before": np.ones(1)},
+                "start": np.zeros((3, 1)),
+            },
+        ),
+        "ReferenceTracker": (
+            p.ReferenceTracker,
+            {
+                **{"controller": p.LinearMPC(SYSTEM, COST, 3), "y_r": np.zeros(2)},
+                **{"constraints": LIMITS, "nearest": False},
+            },
+        ),
+        "ReferenceTracker.track": (tracker.track, {"y_r": np.zeros(2)}),
+        "steady_state": (
+            p.steady_state,
+            {
+                **{"system": SYSTEM, "y_r": np.zeros(2), "constraints": LIMITS},
+                **{"start": (np.zeros(2), np.zeros(1)), "nearest": False},
+            },
+        ),
+        "closed_loops": (
+            p.closed_loops,
+            {"costs": COST, **LOOP, "plants": None, "mesh": None},
+        ),
+        "mpc_rollout": (p.mpc_rollout, {"cost": COST, **LOOP}),
+        "terminal_ingredients": (
+            p.terminal_ingredients,
+            {"system": SYSTEM, "cost": COST, "constraints": LIMITS, "max_steps": 50, "tol": 1e-9},
+        ),
+        "check_stability": (
+            p.check_stability,
+            {
+                **{"system": SYSTEM, "cost": COST, "constraints": LIMITS, "output_cones": ()},
+                "tol": 1e-6,
+            },
+        ),
+        "StabilityCheck.rotated": (check.rotated, {"x": np.ones((2, 2)), "u": np.ones((2, 1))}),
+        # evaluation
+        "accuracy": (p.accuracy, {"model": COST, "comparisons": DATA}),
+        "regret": (p.regret, {"cost": COST, "trajectories": LOOPS, "best": LOOPS[0]}),
+        "win_rate": (
+            p.win_rate,
+            {"preference": PERSON, "first": LOOPS[0], "second": LOOPS[1], "confidence": 0.9},
+        ),
+        "simulate": (
+            p.simulate,
+            {"system": SYSTEM, "controller": still, "x0": np.ones(2), "steps": 2},
+        ),
+    }
+    return {**out, **drawings()}
+
+
+def drawings():
+    return {
+        "plots.responses": (
+            lambda responses, dt: plots.responses(responses, dt, ylabel="y", ax=plt.gca()),
+            {"responses": {"a": np.ones(3)}, "dt": 0.1},
+        ),
+        "plots.boxes": (
+            lambda values: plots.boxes(values, ylabel="y", ax=plt.gca()),
+            {"values": {"a": np.ones(3)}},
+        ),
+        "plots.heatmaps": (
+            lambda matrices: plots.heatmaps(matrices),
+            {"matrices": {"a": np.eye(2)}},
+        ),
+    }
