@@ -56,7 +56,7 @@ class ClosedLoops:
 
     @property
     def status(self) -> np.ndarray:
-        """Status (…, steps) of every solve: "solved", "infeasible" or "max_iterations".
+        """Status (…, steps) of every solve: "solved", "infeasible", "max_iterations" or "failed".
 
         After a failed solve there is no state to solve for; its status stays.
         """

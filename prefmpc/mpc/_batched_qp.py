@@ -152,8 +152,8 @@ def _judged(
     residual = jnp.where(error > 0, error / jnp.where(unit > 0, unit, 1.0), 0.0)
     residual = jnp.where((error > 0) & ~(unit > 0), jnp.inf, residual)
     # XLA's max passes over NaN: what is not finite would look exact.
-    sound = jnp.isfinite(rows).all(-1) & jnp.isfinite(multipliers).all(-1)
-    residual = jnp.where(sound & jnp.isfinite(residual), residual, jnp.inf)
+    sound = jnp.isfinite(rows).all(-1) & jnp.isfinite(multipliers).all(-1) & jnp.isfinite(error)
+    residual = jnp.where(sound, residual, jnp.inf)
     return _Search(multipliers, rows, residual, residual <= jnp.maximum(tol, FINEST), count)
 
 

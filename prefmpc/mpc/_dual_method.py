@@ -28,6 +28,9 @@ FAR = 1e8
 HOPELESS = 1e9
 """Where w has to be so many times as large as anything given, float64 has no digits left."""
 
+LIMIT = (20, 200)
+"""Steps at most, for each variable and for all."""
+
 ROUNDS = 3
 """How often multipliers are computed afresh, and the method goes on from there."""
 
@@ -83,7 +86,7 @@ def dual_method(Y: Any, mine: Any, free: Any, lower: Any, upper: Any, skip: Any)
     Where ``skip`` (b,) nothing is done. Infinite limits are none.
     """
     b, (m, n) = len(mine), Y.shape[1:]
-    limit = 20 * n + 200
+    limit = LIMIT[0] * n + LIMIT[1]
     if len(Y) == 1:
 
         def rows_of(w: Any) -> Any:

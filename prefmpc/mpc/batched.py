@@ -170,8 +170,8 @@ def _solve_many(
 class BatchedMPC(Controller):
     """The MPC of eq. (7) of arXiv 2511.22502 for whole batches of states, costs and models.
 
-    Solves the same problem as `LinearMPC`. With input bounds alone, eq. (12), every answer
-    carries a proven bound on its distance from the optimum.
+    Solves the same problem as `LinearMPC`, in coordinates that keep their digits on unstable
+    plants and long horizons. Every answer carries an estimate of its own error.
 
     Parameters
     ----------
@@ -187,9 +187,8 @@ class BatchedMPC(Controller):
         X_N; or the ingredients of `terminal_ingredients`, whose x_NᵀPx_N is added to the cost;
         the same for all.
     tol : float
-        What counts as solved, in the unit of the input: the largest proven distance ‖U − U*‖₂
-        or, with ``constraints`` or ``terminal``, the largest violation of the optimality
-        conditions. An answer that satisfies them to rounding counts as solved as well.
+        What counts as solved: the largest error of an input, relative to the largest input of the
+        plan, each in the unit in which σ sees it. Below 1e-12 it counts as 1e-12.
 
     Raises
     ------
@@ -238,13 +237,15 @@ class BatchedMPC(Controller):
         )
 
     def _message(self, answer: Answer) -> str:
-        failed = {
-            str(name): int((answer.status == i).sum()) for i, name in enumerate(STATUSES) if i
-        }
-        if not sum(failed.values()):
+        counts = {str(name): int((answer.status == i).sum()) for i, name in enumerate(STATUSES)}
+        solved = counts.pop("solved")
+        if solved == answer.status.size:
             return "optimal"
-        parts = [f"{count} {name}" for name, count in failed.items() if count]
+        parts = [f"{count} {name}" for name, count in counts.items() if count]
+        why = ""
+        if counts["failed"]:
+            why = "; failed: no plan was found whose error float64 can tell to be within tolerance"
         return (
             f"of {answer.status.size} problems {' and '.join(parts)}; "
-            f"tolerance {self.tol:g}, worst residual {np.nanmax(answer.residual):.2g}"
+            f"tolerance {self.tol:g}, worst residual {np.max(answer.residual):.2g}{why}"
         )
