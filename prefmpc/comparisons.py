@@ -155,7 +155,7 @@ class Comparisons:
             )
         n = len(first)
         answers = finite_array("labels", labels, booleans=True)
-        if answers.shape != (n,):
+        if answers.size and answers.shape != (n,):
             raise ValueError(f"labels must have shape ({n},), one a pair, got {answers.shape}")
         both = jax.tree.map(lambda a, b: np.concatenate([a, b]), first, second)
         return cls(both, np.arange(n), np.arange(n, 2 * n), answers)
@@ -236,7 +236,7 @@ def _recorded(side: str, x: ArrayLike, u: ArrayLike, y: ArrayLike | None) -> Tra
         return Trajectory(x, u, y)
     except ValueError as error:
         names = f"x_{side}, u_{side} and y_{side}"
-        raise ValueError(f"{names} must make trajectories: {error}") from None
+        raise ValueError(f"{names} do not fit: {error}") from None
 
 
 def _check_pool(trajectories: Any) -> None:

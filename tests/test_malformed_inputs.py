@@ -2,7 +2,7 @@
 
 `malformed_calls` has a valid call of every callable of the package; each argument of it is then
 replaced by what `malformed_values` holds. A few values of each argument are tried; with
-``PREFMPC_MALFORMED=all`` in the environment all 25,000 (some minutes).
+``PREFMPC_MALFORMED=all`` in the environment all 20,000 (a minute).
 """
 
 from __future__ import annotations
