@@ -65,8 +65,9 @@ class _Data(NamedTuple):
 
 
 class _Search(NamedTuple):
-    """Where the search for λ stands; the same leading axes (c, k), or (b,) in a chunk."""
+    """Where the search stands; the same leading axes (c, k), or (b,) in a chunk."""
 
+    w: Any
     multipliers: Any
     rows: Any
     residual: Any
@@ -84,8 +85,9 @@ def solve(problem: CondensedProblem, x0: Any, tol: Any, *, start: Any = None) ->
     data, impossible = _data(problem, x0)
     dead = ~jnp.isfinite(data.free).all(-1) | impossible
     start = jnp.zeros_like(data.free) if start is None else start
-    none, one = jnp.zeros_like(data.free), jnp.ones(dead.shape)
-    found = _judged(data, none, data.free, one, n, jnp.zeros(dead.shape, dtype=int), tol)
+    none, still = jnp.zeros_like(data.free), jnp.zeros((*dead.shape, n))
+    error = _error(data, none, data.free, jnp.ones(dead.shape))
+    found = _judged(data, still, none, data.free, error, n, jnp.zeros(dead.shape, int), tol)
     if problem.fixed is None:
         found = _active_set(problem, data, start, found, dead, tol)
     ended = jax.lax.cond(
@@ -98,11 +100,10 @@ def solve(problem: CondensedProblem, x0: Any, tol: Any, *, start: Any = None) ->
     if problem.fixed is None:  # input bounds alone always leave a plan, however bad
         infeasible = dead & False
     U = jnp.clip(found.rows, data.lower, data.upper)[..., :n] * problem.scale[:, None]
-    w = -(found.multipliers @ problem.Y)
     status = jnp.where(found.done & jnp.isfinite(U).all(-1), SOLVED, FAILED)
     status = jnp.where(limited, UNFINISHED, status)
     status = jnp.where(impossible | infeasible, INFEASIBLE, status)
-    return Answer(U, w, found.multipliers, status, found.residual, found.iterations)
+    return Answer(U, found.w, found.multipliers, status, found.residual, found.iterations)
 
 
 def _data(problem: CondensedProblem, x0: Any) -> tuple[_Data, Any]:
@@ -132,9 +133,22 @@ def _moved(problem: CondensedProblem, multipliers: Any) -> Any:
 
 
 def _judged(
-    data: _Data, multipliers: Any, rows: Any, softness: Any, n: int, count: Any, tol: Any
+    data: _Data, w: Any, multipliers: Any, rows: Any, error: Any, n: int, count: Any, tol: Any
 ) -> _Search:
-    """Say how far λ is from optimal, without trusting where it comes from.
+    """Say how large the ``error`` of one of the first n rows is, beside the largest of them."""
+    inputs = jnp.maximum(jnp.abs(rows[..., :n]), 1e-6 * jnp.abs(data.free[..., :n]))
+    unit = inputs.max(-1)
+    some = (error > 0) & (unit > 0)
+    residual = jnp.where(some, error / jnp.where(some, unit, 1.0), error)
+    # XLA's max passes over NaN: what is not finite would look exact.
+    sound = jnp.isfinite(rows).all(-1) & jnp.isfinite(multipliers).all(-1) & jnp.isfinite(error)
+    residual = jnp.where(sound, residual, jnp.inf)
+    done = residual <= jnp.maximum(tol, FINEST)
+    return _Search(w, multipliers, rows, residual, done, count)
+
+
+def _error(data: _Data, multipliers: Any, rows: Any, softness: Any) -> Any:
+    """Say how far w = −Yᵀλ is from optimal, without trusting where λ comes from.
 
     Were the limits of the active rows where these rows are, λ would be optimal: ``miss`` is how
     far the limits are from there. To move the rows onto them takes ‖Δw‖ ≤ √softness·‖miss‖, where
@@ -142,19 +156,10 @@ def _judged(
     optimum then is within twice that. What rounding may have done to rows counts as a miss too.
     """
     miss = jnp.clip(rows + multipliers, data.lower, data.upper) - rows
-    active = multipliers != 0
     size = jnp.abs(rows) + jnp.abs(data.free)
-    rounding = jnp.where(active, ROUNDING * size, 0.0)
+    rounding = jnp.where(multipliers != 0, ROUNDING * size, 0.0)
     miss = jnp.linalg.norm(jnp.abs(miss) + rounding, axis=-1)
-    error = jnp.sqrt(softness) * miss + ROUNDING * jnp.linalg.norm(multipliers, axis=-1)
-    inputs = jnp.maximum(jnp.abs(rows[..., :n]), 1e-6 * jnp.abs(data.free[..., :n]))
-    unit = inputs.max(-1)
-    residual = jnp.where(error > 0, error / jnp.where(unit > 0, unit, 1.0), 0.0)
-    residual = jnp.where((error > 0) & ~(unit > 0), jnp.inf, residual)
-    # XLA's max passes over NaN: what is not finite would look exact.
-    sound = jnp.isfinite(rows).all(-1) & jnp.isfinite(multipliers).all(-1) & jnp.isfinite(error)
-    residual = jnp.where(sound, residual, jnp.inf)
-    return _Search(multipliers, rows, residual, residual <= jnp.maximum(tol, FINEST), count)
+    return jnp.sqrt(softness) * miss + ROUNDING * jnp.linalg.norm(multipliers, axis=-1)
 
 
 def _active(data: _Data, multipliers: Any, rows: Any) -> tuple[Any, Any]:
@@ -206,7 +211,9 @@ def _active_set(
         # With the same rows as before there is little left to do, and little to learn from it.
         softness = jnp.where((active == before).all(-1), jnp.maximum(found, softness), found)
         rows -= _moved(problem, more)
-        new = _judged(data, kept + more, rows, softness, n, now.iterations + 1, tol)
+        multipliers = kept + more
+        error = _error(data, multipliers, rows, softness)
+        new = _judged(data, now.w, multipliers, rows, error, n, now.iterations + 1, tol)
         new = _kept(idle, now, new)
         return k + 1, new, active, idle | new.done, softness
 
@@ -279,7 +286,11 @@ def _left_over(
         mine, before = jax.tree.map(lambda a: a[lane], one_row)
         own = lane // k
         dual = dual_method(problem.Y, own, mine.free, mine.lower, mine.upper, skip)
-        new = _judged_alone(problem.Y, own, mine, dual, n, before.iterations, tol)
+        w, multipliers = dual.w, dual.multipliers
+        moved = w @ problem.Y[0].T if c == 1 else jnp.einsum("bmn,bn->bm", problem.Y[own], w)
+        count = before.iterations + dual.count
+        rows = mine.free + moved
+        new = _judged(mine, w, multipliers, rows, dual.error, n, count, tol)
         # Two methods have tried: what was found last is kept if it is the better one.
         new = _kept(~(new.residual < before.residual), before, new)
         place = jnp.where(skip, lanes, lane)  # out of bounds: dropped
@@ -296,19 +307,6 @@ def _left_over(
     _, out, infeasible, limited = jax.lax.while_loop(lambda carry: carry[0] < left, work, begin)
     shaped = jax.tree.map(lambda a: a.reshape(c, k, *a.shape[1:]), out)
     return shaped, infeasible.reshape(c, k), limited.reshape(c, k)
-
-
-def _judged_alone(
-    Y: Any, own: Any, data: _Data, dual: Any, n: int, count: Any, tol: Any
-) -> _Search:
-    """Judge b problems of different controllers."""
-    if len(Y) == 1:
-        rows = data.free - (dual.multipliers @ Y[0]) @ Y[0].T
-    else:
-        mine = Y[own]
-        w = jnp.einsum("bmn,bm->bn", mine, dual.multipliers)
-        rows = data.free - jnp.einsum("bmn,bn->bm", mine, w)
-    return _judged(data, dual.multipliers, rows, dual.softness, n, count + dual.count, tol)
 
 
 def with_derivative(problem: CondensedProblem, x0: Any, answer: Answer) -> Any:

@@ -22,10 +22,12 @@ ROOM = 1e-13
 DEPENDENT = 1e-10
 """The part of a row that the active ones do not span has at least this length to count."""
 
+ROUNDING = 1e-15
+
 FAR = 1e8
 """There is no solution if every one would have to lie so many times as far out as w is."""
 
-HOPELESS = 1e9
+HOPELESS = 1e11
 """Where w has to be so many times as large as anything given, float64 has no digits left."""
 
 LIMIT = (20, 200)
@@ -36,10 +38,11 @@ ROUNDS = 3
 
 
 class Dual(NamedTuple):
-    """Multipliers (b, m); their softness, 1 over a bound on σ² (b,); verdicts; steps taken."""
+    """w (b, n) and multipliers (b, m); the largest error of one of the first n rows; verdicts."""
 
+    w: Any
     multipliers: Any
-    softness: Any
+    error: Any
     infeasible: Any
     limited: Any
     count: Any
@@ -132,7 +135,8 @@ def dual_method(Y: Any, mine: Any, free: Any, lower: Any, upper: Any, skip: Any)
         more = _of(s.N, z)
         r, z = r + more, z - _back(s.C, more)
         length = jnp.linalg.norm(z, axis=-1)
-        moves = length > DEPENDENT
+        # What is left of a sum of large terms is rounding.
+        moves = length > jnp.maximum(DEPENDENT, 10 * ROUNDING * jnp.abs(r).sum(-1))
         full = jnp.where(moves, violation / jnp.where(moves, length, 1.0) ** 2, jnp.inf)
         bound = (s.row >= 0) & ~jnp.take_along_axis(equal, s.row, axis=1) & (r > 1e-14)
         room = jnp.where(bound, s.force / jnp.where(bound, r, 1.0), jnp.inf)
@@ -227,6 +231,37 @@ def dual_method(Y: Any, mine: Any, free: Any, lower: Any, upper: Any, skip: Any)
     lanes = jnp.arange(b)[:, None]
     place = jnp.where(end.row >= 0, end.row, m)
     multipliers = jnp.zeros((b, m + 1)).at[lanes, place].add(end.sign * end.force)[:, :m]
-    softness = jnp.maximum(jnp.sum(end.N**2, axis=(1, 2)), 1.0)
     limited = ~end.done | (end.count >= limit)
-    return Dual(multipliers, softness, end.infeasible, limited, end.count)
+    inputs = Y[:, :n] if len(Y) == 1 else own[:, :n]
+    error = _error(end, equal, rows_of(end.w), lower, upper, inputs)
+    return Dual(end.w, multipliers, error, end.infeasible, limited, end.count)
+
+
+def _error(end: _State, equal: Any, rows: Any, lower: Any, upper: Any, inputs: Any) -> Any:
+    """Estimate the largest error of one of the first n rows, from what w and λ are, not how.
+
+    How far active rows are from their limits, rounding included, moves the other rows by Y N, and
+    active ones not at all. A multiplier too small to be sure of its sign is another error, as is
+    the part of w that the active rows do not span, and a row beyond its limits.
+    """
+    radius = jnp.linalg.norm(end.w, axis=-1)[:, None]
+    held = end.row >= 0
+    miss = jnp.abs(_of(end.C, end.w) - end.target)
+    miss = jnp.where(held, miss + ROUNDING * (jnp.abs(end.target) + radius), 0.0)
+    spread = jnp.abs(
+        jnp.einsum("...in,bjn->bij" if inputs.ndim == 2 else "bin,bjn->bij", inputs, end.N)
+    )
+    astray = end.w - _back(end.C, _of(end.N, end.w))
+    astray = astray - _back(end.C, _of(end.N, astray))
+    aside = jnp.abs(inputs @ astray[..., None])[..., 0]
+    n = inputs.shape[-2]
+    active = (jnp.arange(n)[None, :, None] == end.row[:, None, :]).any(-1)
+    moved = (_of(spread, miss) + jnp.where(active, 0.0, aside)).max(-1)
+    weights = jnp.linalg.norm(end.N, axis=-1)
+    unsure = ROUNDING * weights * radius
+    free = jnp.take_along_axis(equal, end.row, axis=1)
+    wrong = jnp.where(held & ~free & (end.force < unsure), unsure - jnp.minimum(end.force, 0), 0.0)
+    beyond = jnp.maximum(jnp.maximum(rows - upper, lower - rows), 0.0).max(-1)
+    softness = jnp.sqrt(jnp.sum(weights**2, axis=-1))
+    large = jnp.where(beyond > 100 * ROOM * (jnp.abs(rows).max(-1) + radius[:, 0]), softness, 1.0)
+    return moved + wrong.max(-1) + large * beyond
