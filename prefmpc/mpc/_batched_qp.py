@@ -285,7 +285,9 @@ def _left_over(
         skip = i + jnp.arange(chunk) >= left
         mine, before = jax.tree.map(lambda a: a[lane], one_row)
         own = lane // k
-        dual = dual_method(problem.Y, own, mine.free, mine.lower, mine.upper, skip)
+        dual = dual_method(
+            problem.Y, own, problem.order[0], mine.free, mine.lower, mine.upper, skip
+        )
         w, multipliers = dual.w, dual.multipliers
         moved = w @ problem.Y[0].T if c == 1 else jnp.einsum("bmn,bn->bm", problem.Y[own], w)
         count = before.iterations + dual.count

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc._limits import MOVES, input_size
@@ -62,6 +63,9 @@ class CondensedProblem(NamedTuple):
     lower: Any
     upper: Any
     scale: Any
+    order: Any
+    """Which rows to look at first: with limits on the states, those of early stages. What cannot be
+    kept on an unstable plant shows there, before everything grows beyond measure."""
     dual: Any
     """Y Yᵀ, how far one row moves when the multiplier of another grows; None if it is large."""
     fixed: Fixed | None
@@ -109,14 +113,22 @@ def condense(
         states.append(rows.last)
         still.append(_unmoved(system, rows.last, None, horizon + 1)[-1])
     if not limits:
-        return _normalised(Y, E, lower, upper, None, law)
+        return _normalised(Y, E, lower, upper, jnp.zeros(len(Y)), None, law)
+    left = horizon - np.arange(horizon)
+    times: list[Any] = [np.repeat(left, system.nu)]
+    if rows.stage is not None:
+        times.append(np.repeat(left, len(rows.stage)))
+    if rows.last is not None:
+        times.append(np.zeros(len(rows.last)))
+    order = np.concatenate(times) * (rows.stage is not None)
     h, unit = jnp.concatenate(limits), jnp.ones(())
     size = input_size(system.u_min, system.u_max)
     fixed = Fixed(
         jnp.concatenate(still), system.A, system.B, size, jnp.concatenate(states), h, unit
     )
     lower = jnp.concatenate([lower, jnp.full(len(h), -jnp.inf)])
-    return _normalised(Y, E, lower, jnp.concatenate([upper, h]), fixed, law)
+    upper = jnp.concatenate([upper, h])
+    return _normalised(Y, E, lower, upper, jnp.asarray(order, float), fixed, law)
 
 
 def _law(system: LinearSystem, cost: QuadraticCost, horizon: int, P: Any) -> Law:
@@ -186,7 +198,7 @@ def scaled(
     Y = root.T * unit[:, None]
     plan = -Y @ (Y.T @ F)
     if rows is None:
-        return _normalised(Y, plan, lower, upper, None, None)
+        return _normalised(Y, plan, lower, upper, jnp.zeros(len(Y)), None, None)
     G, E, limits = rows
     nx = F.shape[1]
     still = jnp.linalg.norm(G @ Y, axis=1) <= MOVES * (jnp.abs(G) @ jnp.linalg.norm(Y, axis=1))
@@ -195,11 +207,12 @@ def scaled(
     lower = jnp.concatenate([lower, jnp.full(len(limits), -jnp.inf)])
     upper = jnp.concatenate([upper, limits])
     both = jnp.concatenate([plan, E + G @ plan])
-    return _normalised(jnp.concatenate([Y, G @ Y]), both, lower, upper, fixed, None)
+    Y = jnp.concatenate([Y, G @ Y])
+    return _normalised(Y, both, lower, upper, jnp.zeros(len(Y)), fixed, None)
 
 
 def _normalised(
-    Y: Any, E: Any, lower: Any, upper: Any, fixed: Fixed | None, law: Law | None
+    Y: Any, E: Any, lower: Any, upper: Any, order: Any, fixed: Fixed | None, law: Law | None
 ) -> CondensedProblem:
     """Give the rows unit length."""
     # The unit of a row changes no solution: it needs no derivative.
@@ -212,4 +225,5 @@ def _normalised(
         fixed = fixed._replace(rows=still[n:], unit=length[n:])
     Y, E = Y / length[:, None], E / length[:, None]
     dual = Y @ Y.T if len(Y) <= 2 * n else None
-    return CondensedProblem(Y, E, lower / length, upper / length, length[:n], dual, fixed, law)
+    limits = lower / length, upper / length
+    return CondensedProblem(Y, E, *limits, length[:n], order, dual, fixed, law)

@@ -1,9 +1,9 @@
 """Goldfarb and Idnani's dual active-set method for many least-distance problems side by side.
 
 min ½‖w‖² over l ≤ e + Y w ≤ u, rows of Y of unit length. Starts at w = 0 without any row, takes up
-the most violated row at a time, and lets go of those whose multipliers would change sign. Each
-step raises the minimum, so that none comes back; a row that cannot be met by moving w, nor by
-letting go of others, is the proof that there is no solution.
+a violated row at a time, and lets go of those whose multipliers would change sign. Each step
+raises the minimum, so that none comes back; a row that cannot be met by moving w, nor by letting
+go of others, is the proof that there is no solution.
 
 Kept of the active rows C, in slots: C itself and its pseudo-inverse, N = (C Cᵀ)⁻¹C, which changes
 by a product of two vectors in each step. All steps of all problems are the same few products.
@@ -25,7 +25,7 @@ DEPENDENT = 1e-10
 ROUNDING = 1e-15
 
 FAR = 1e8
-"""There is no solution if every one would have to lie so many times as far out as w is."""
+"""There is no solution if each would have to lie so many times as far out as w and the limits."""
 
 HOPELESS = 1e11
 """Where w has to be so many times as large as anything given, float64 has no digits left."""
@@ -83,10 +83,13 @@ def _at(array: Any, index: Any) -> Any:
     return jnp.take_along_axis(array, index[:, None], axis=1)[:, 0]
 
 
-def dual_method(Y: Any, mine: Any, free: Any, lower: Any, upper: Any, skip: Any) -> Dual:
+def dual_method(
+    Y: Any, mine: Any, order: Any, free: Any, lower: Any, upper: Any, skip: Any
+) -> Dual:
     """Solve b problems: Y (c, m, n), ``mine`` (b,) which of them, the rest (b, m).
 
-    Where ``skip`` (b,) nothing is done. Infinite limits are none.
+    Of violated rows one with the largest ``order`` (m,) is taken up, of these the worst. Where
+    ``skip`` (b,) nothing is done. Infinite limits are none.
     """
     b, (m, n) = len(mine), Y.shape[1:]
     limit = LIMIT[0] * n + LIMIT[1]
@@ -114,13 +117,14 @@ def dual_method(Y: Any, mine: Any, free: Any, lower: Any, upper: Any, skip: Any)
 
     def step(state: _State) -> _State:
         s = state
-        # The row to take up: the one begun, or the most violated.
+        # The row to take up: the one begun, or the worst of the first in order.
         rows = rows_of(s.w)
         over, under = rows - upper, lower - rows
         radius = jnp.linalg.norm(s.w, axis=-1)
         size = jnp.abs(free) + radius[:, None]
         beyond = jnp.maximum(over, under)
-        worst = jnp.argmax(jnp.where(beyond > ROOM * size, beyond, 0.0), axis=-1)
+        share = beyond / (beyond + largest[:, None])
+        worst = jnp.argmax(jnp.where(beyond > ROOM * size, order + share, 0.0), axis=-1)
         fresh = s.new < 0
         p = jnp.where(fresh, worst, s.new)
         side = jnp.where(fresh, jnp.where(_at(over, p) >= _at(under, p), 1.0, -1.0), s.side)
@@ -145,7 +149,7 @@ def dual_method(Y: Any, mine: Any, free: Any, lower: Any, upper: Any, skip: Any)
 
         reach = violation / jnp.maximum(length, 1e-300)
         nowhere = ~arrived & (~jnp.isfinite(t) | (radius > HOPELESS * largest))
-        proof = nowhere & ~jnp.isfinite(t) & (reach > FAR * radius) & (reach > 0)
+        proof = nowhere & ~jnp.isfinite(t) & (reach > FAR * (radius + largest))
         done = s.done | arrived | nowhere | ~jnp.isfinite(violation)
         go = ~done
         t = jnp.where(go, t, 0.0)
