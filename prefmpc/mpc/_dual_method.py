@@ -60,6 +60,10 @@ class _State(NamedTuple):
     row: Any
     """Which row a slot holds (b, n); −1 if it is free."""
     sign: Any
+    held: Any
+    """Rows that are active (b, m): what rounding leaves of them is no violation."""
+    spared: Any
+    """Rows (b, m) that seem violated, depend on the active ones, and may be so by rounding."""
     new: Any
     """The row that is being taken up (b,); −1 between two."""
     side: Any
@@ -123,14 +127,15 @@ def dual_method(
         radius = jnp.linalg.norm(s.w, axis=-1)
         size = jnp.abs(free) + radius[:, None]
         beyond = jnp.maximum(over, under)
+        open_ = ~(s.held | s.spared)
         share = beyond / (beyond + largest[:, None])
-        worst = jnp.argmax(jnp.where(beyond > ROOM * size, order + share, 0.0), axis=-1)
+        worst = jnp.argmax(jnp.where(open_ & (beyond > ROOM * size), order + share, 0.0), axis=-1)
         fresh = s.new < 0
         p = jnp.where(fresh, worst, s.new)
         side = jnp.where(fresh, jnp.where(_at(over, p) >= _at(under, p), 1.0, -1.0), s.side)
         push = jnp.where(fresh, 0.0, s.push)
         violation = jnp.where(side > 0, _at(over, p), _at(under, p))
-        arrived = fresh & ~(violation > ROOM * _at(size, p))
+        arrived = fresh & ~((violation > ROOM * _at(size, p)) & _at(open_, p))
 
         # Moving by −z lowers it and keeps the active rows where they are.
         normal = side[:, None] * row_of(p)
@@ -140,7 +145,8 @@ def dual_method(
         r, z = r + more, z - _back(s.C, more)
         length = jnp.linalg.norm(z, axis=-1)
         # What is left of a sum of large terms is rounding.
-        moves = length > jnp.maximum(DEPENDENT, 10 * ROUNDING * jnp.abs(r).sum(-1))
+        terms = 10 * ROUNDING * (1 + jnp.abs(r).sum(-1))
+        moves = length > jnp.maximum(DEPENDENT, terms)
         full = jnp.where(moves, violation / jnp.where(moves, length, 1.0) ** 2, jnp.inf)
         bound = (s.row >= 0) & ~jnp.take_along_axis(equal, s.row, axis=1) & (r > 1e-14)
         room = jnp.where(bound, s.force / jnp.where(bound, r, 1.0), jnp.inf)
@@ -148,10 +154,12 @@ def dual_method(
         t = jnp.minimum(full, _at(room, first))
 
         reach = violation / jnp.maximum(length, 1e-300)
-        nowhere = ~arrived & (~jnp.isfinite(t) | (radius > HOPELESS * largest))
-        proof = nowhere & ~jnp.isfinite(t) & (reach > FAR * (radius + largest))
-        done = s.done | arrived | nowhere | ~jnp.isfinite(violation)
-        go = ~done
+        blocked, hopeless = ~arrived & ~jnp.isfinite(t), radius > HOPELESS * largest
+        spare = blocked & (violation <= terms * (radius + largest))
+        proof = blocked & ~spare & (reach > FAR * (radius + largest))
+        nowhere = (blocked & ~spare) | (~arrived & hopeless) | ~jnp.isfinite(violation)
+        done = s.done | arrived | nowhere
+        go = ~(done | spare)
         t = jnp.where(go, t, 0.0)
         add = go & (full <= _at(room, first))
         drop = go & ~add
@@ -174,6 +182,10 @@ def dual_method(
         gone, comes = (place & drop)[:, :, None], (place & add)[:, :, None]
         N = jnp.where(gone, 0.0, N)
         C = jnp.where(gone, 0.0, jnp.where(comes, normal[:, None, :], s.C))
+        lines = jnp.arange(m)[None, :]
+        held = s.held & ~(drop & (lines == _at(s.row, first)[:, None]))
+        held |= add & (lines == p[:, None])
+        spared = (s.spared | (spare[:, None] & (lines == p[:, None]))) & ~go[:, None]
         limits = jnp.where(side > 0, _at(upper - free, p), _at(free - lower, p))
 
         def put(old: Any, taken: Any, free_slot: Any) -> Any:
@@ -188,13 +200,15 @@ def dual_method(
             force=put(force, push, 0.0),
             row=put(s.row, p, -1),
             sign=put(s.sign, side, 0.0),
+            held=held,
+            spared=spared,
             new=jnp.where(drop[:, 0], p, -1),
             side=side,
             push=push,
             done=done,
             infeasible=s.infeasible | (proof & ~s.done),
             stuck=s.stuck | (nowhere & ~proof & ~s.done),
-            count=s.count + go,
+            count=s.count + ~done,
         )
 
     def afresh(s: _State) -> _State:
@@ -224,9 +238,9 @@ def dual_method(
 
     zero, none = jnp.zeros((b, n)), jnp.zeros((b, n, n))
     nothing, no = jnp.full(b, -1), jnp.zeros(b, bool)
-    count = jnp.zeros(b, int)
+    count, none_yet = jnp.zeros(b, int), jnp.zeros((b, m), bool)
     start = _State(
-        zero, none, none, zero, zero, jnp.full((b, n), -1), zero,
+        zero, none, none, zero, zero, jnp.full((b, n), -1), zero, none_yet, none_yet,
         nothing, jnp.ones(b), jnp.zeros(b), skip, no, no, count,
     )  # fmt: skip
     _, end = jax.lax.while_loop(
