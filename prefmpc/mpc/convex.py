@@ -11,15 +11,29 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import instance, positive_int
 from prefmpc.models import QuadraticCost, SumCost
-from prefmpc.mpc._cone import ParametricProgram, expression, mpc_solution, stage_limits
+from prefmpc._units import cost_units
+from prefmpc.mpc._cone import ParametricProgram
+from prefmpc.mpc._expressions import (
+    check_cones,
+    check_convex,
+    expression,
+    factor,
+    per_unit,
+    stage_limits,
+    weights,
+)
+from prefmpc.mpc._fixed import FixedCone, FixedRows
 from prefmpc.mpc.solution import (
     Controller,
     MPCSolution,
     check_dimension,
     check_single_state,
+    fixed_message,
+    mpc_solution,
+    no_plan,
 )
 from prefmpc.mpc.stability import StabilityCheck
-from prefmpc.mpc.terminal import TerminalIngredients, terminal_set
+from prefmpc.mpc.terminal import TerminalIngredients, check_polyhedron, terminal_set
 from prefmpc.networks import ICNNCost
 from prefmpc.sets import Ellipsoid, Polyhedron, SecondOrderCone
 from prefmpc.systems import LinearSystem
@@ -66,40 +80,72 @@ class ConvexMPC(Controller):
         output_cones: Sequence[SecondOrderCone] = (),
         terminal: Polyhedron | Ellipsoid | TerminalIngredients | StabilityCheck | None = None,
     ) -> None:
-        import cvxpy
-
-        cp: Any = cvxpy
         instance("system", system, LinearSystem)
         self.system, self.cost = system, cost
         self.horizon = positive_int("horizon", horizon)
-        nx, nu, N = system.nx, system.nu, self.horizon
-        x0 = cp.Parameter(nx)
-        X, U = cp.Variable((N + 1, nx)), cp.Variable((N, nu))
-        total = expression(cp, cost, X[:-1], U)
-        limits = [
-            X[0] == x0,
-            X[1:] == X[:-1] @ system.A.T + U @ system.B.T,
-            *stage_limits(cp, system, constraints, output_cones, X[:-1], U),
-        ]
+        check_convex(cost, system.nx, system.nu, self.horizon)
+        check_polyhedron("constraints", constraints, system.nx + system.nu)
+        check_cones(system, output_cones)
+        point = None
         if isinstance(terminal, StabilityCheck):
             if not terminal.stable:
                 raise ValueError(f"terminal must be a check that says yes, got: {terminal.reason}")
-            check_dimension("terminal", terminal.x.size, nx)
-            limits.append(X[N] == terminal.x)
-            terminal = None
-        final, last = terminal_set(terminal, nx, ellipsoid=True)
+            check_dimension("terminal", terminal.x.size, system.nx)
+            point, terminal = terminal.x, None
+        final, last = terminal_set(terminal, system.nx, ellipsoid=True)
+        end = last if isinstance(last, Polyhedron) else None
+        rows = FixedRows(system, self.horizon, constraints, end)
+        cones = [FixedCone(system, self.horizon, cone) for cone in output_cones]
+        self._fixed = [rows, *cones]
+        weighing = weights(cost, system.nx, system.nu)
+        self._units = cost_units(
+            system.A, system.B, *weighing, final=final, steps=self.horizon
+        )
+        self._build(constraints, output_cones, final, last, point)
+
+    def _build(self, constraints: Any, output_cones: Any, final: Any, last: Any, point: Any) -> None:
+        """Set up the program in units in which the signals, and σ, are of order one."""
+        import cvxpy
+
+        cp: Any = cvxpy
+        system, N, (dx, du) = self.system, self.horizon, self._units
+        x0 = cp.Parameter(system.nx)
+        X, U = cp.Variable((N + 1, system.nx)), cp.Variable((N, system.nu))
+        A, B = system.A * dx / dx[:, None], system.B * du / dx[:, None]
+        states = cp.multiply(X, np.tile(dx, (N + 1, 1)))
+        inputs = cp.multiply(U, np.tile(du, (N, 1)))
+        total = expression(cp, self.cost, states[:-1], inputs)
+        rows, cones = self._fixed[0], self._fixed[1:]
+        left_out = rows.stage, [cone.stage for cone in cones]
+        limits = [
+            X[0] == x0,
+            X[1:] == X[:-1] @ A.T + U @ B.T,
+            *stage_limits(
+                cp, system, constraints, output_cones, (X[:-1], U), self._units, left_out
+            ),
+        ]
+        if point is not None:
+            limits.append(X[N] == point / dx)
         if final is not None:
-            total += cp.sum_squares(np.linalg.cholesky(final).T @ X[N])
+            total += cp.sum_squares(factor(final).T @ states[N])
         if isinstance(last, Ellipsoid):
-            root = np.linalg.cholesky(last.P).T
-            limits.append(cp.norm(root @ X[N], 2) <= np.sqrt(last.level))
-        elif last is not None and len(last.h):
-            limits.append(last.H @ X[N] <= last.h)
+            root = factor(last.P).T * dx / np.sqrt(last.level)
+            size = np.abs(root).max()
+            limits.append(cp.norm(root / size @ X[N], 2) <= 1 / size)
+        elif last is not None and not rows.last.all():
+            H, h = per_unit(last.H[~rows.last] * dx, last.h[~rows.last])
+            limits.append(H @ X[N] <= h)
         self._program = ParametricProgram(cp.Problem(cp.Minimize(total), limits), x0, (X, U))
 
     def solve(self, x0: ArrayLike) -> MPCSolution:
-        """Solve for the state x0 (nx,); see `MPCSolution`. Raises a ValueError on a bad x0."""
+        """Solve for the state x0 (nx,); see `MPCSolution`. Raises a ValueError on a bad x0.
+
+        Several threads may use the same controller; they take turns.
+        """
         state = check_single_state(x0, self.system.nx)
         began = time.perf_counter()
-        found, (states, inputs) = self._program.solve(state)
-        return mpc_solution(self.system, state, states, inputs, found, began)
+        if any(limit.broken(state) for limit in self._fixed):
+            return no_plan(self.system, self.horizon, "infeasible", fixed_message(state), began)
+        dx, du = self._units
+        found, (states, inputs) = self._program.solve(state / dx)
+        return mpc_solution(self.system, state, states * dx, inputs * du, found, began)
