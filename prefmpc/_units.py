@@ -37,7 +37,7 @@ def cost_units(
         P = (P + P.T) / 2
         S = R + B.T @ P @ B
     states, inputs = _inverse_roots(np.diag(P)), _inverse_roots(np.diag(S))
-    return _completed(A, B, states, inputs)
+    return completed_units(A, B, states, inputs)
 
 
 def power_of_two(size: float) -> float:
@@ -51,7 +51,7 @@ def _inverse_roots(values: np.ndarray) -> np.ndarray:
     return np.where(usable, 1 / np.sqrt(np.where(usable, values, 1.0)), 0.0)
 
 
-def _completed(
+def completed_units(
     A: np.ndarray, B: np.ndarray, states: np.ndarray, inputs: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Give a unit to what has none yet (0): from what drives it, else from what it drives."""

@@ -163,11 +163,13 @@ class ConeProgram:
         with self._lock:
             if self._solver is None:
                 self._solver = self._new_solver({})
-            found = self._judged(self._run(self._solver, near, q), q, b)
-            for options in _SECOND_TRIES:
+            for options in (None, *_SECOND_TRIES):
+                solver = self._solver if options is None else self._new_solver(options)
+                if self._mixed:
+                    solver.update(q=q)
+                found = self._judged(self._run(solver, near), q, b)
                 if found.status != "failed":
                     break
-                found = self._judged(self._run(self._new_solver(options), near, q), q, b)
         z = found.z * unit
         scale = unit if self._mixed or not self._q.any() else 1.0
         objective = float(0.5 * z @ (self._P @ z) + self._q @ z)
@@ -176,8 +178,8 @@ class ConeProgram:
         )
 
     @staticmethod
-    def _run(solver: Any, b: np.ndarray, q: np.ndarray) -> ConeSolution:
-        solver.update(b=b, q=q)
+    def _run(solver: Any, b: np.ndarray) -> ConeSolution:
+        solver.update(b=b)
         found = solver.solve()
         said = str(found.status)
         status = {"Solved": "solved", "AlmostSolved": "solved", "PrimalInfeasible": "infeasible"}
