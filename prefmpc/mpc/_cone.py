@@ -11,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from prefmpc._units import power_of_two
-from prefmpc.mpc._refine import refined
+from prefmpc.mpc._refine import Refiner
 
 # Clarabel calls a point "almost solved" when it gets no further than the reduced tolerances. It
 # has no say in what counts as solved here: that is the residual below.
@@ -20,7 +20,7 @@ _TOLERANCES = {
     **{"reduced_tol_gap_abs": 1e-6, "reduced_tol_gap_rel": 1e-6, "reduced_tol_feas": 1e-6},
 }
 
-TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
+TIGHT = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-10}
 """Where there is hardly any room u is sensitive; only exponential cones do not reach this."""
 
 SOLVED = 1e-7
@@ -92,7 +92,11 @@ class ConeProgram:
         self._P, self._q = sp.csc_matrix(P), np.asarray(q, dtype=np.float64)
         self._A = sp.csc_matrix(sp.diags_array(self._per_row) @ A)
         self._A_by_columns = sp.csr_matrix(self._A.T)
-        self._flat = all(kind in ("zero", "nonnegative") for kind, _ in self._cones)
+        self._equations = np.zeros(len(b), dtype=bool)
+        for kind, part in self._parts():
+            self._equations[part] = kind == "zero"
+        flat = all(kind in ("zero", "nonnegative") for kind, _ in self._cones)
+        self._refine = Refiner(self._P, self._A) if flat else None
         self._mixed = bool(self._P.count_nonzero() and self._q.any())
         self._solver: Any = None
         self._lock = threading.Lock()
@@ -205,13 +209,10 @@ class ConeProgram:
             return dataclasses.replace(found, residual=self._residual(found.z, found.y, q, b))
         z, y = found.z, found.y
         residual = self._residual(z, y, q, b)
-        if self._flat and not residual <= GOOD and np.isfinite(z).all() and np.isfinite(y).all():
-            equal = np.zeros(len(b), dtype=bool)
-            for kind, part in self._parts():
-                equal[part] = kind == "zero"
-            low = np.where(equal, b, -np.inf)
-            other = refined(self._P, q, self._A, low, b, z, y)
-            if (less := self._residual(*other, q, b)) < residual or not np.isfinite(residual):
+        if self._refine is not None and not residual <= GOOD and np.isfinite(residual):
+            low = np.where(self._equations, b, -np.inf)
+            other = self._refine(q, low, b, z, y)
+            if (less := self._residual(*other, q, b)) < residual:
                 (z, y), residual = other, less
         if residual <= SOLVED:
             note = "optimal" if residual <= 1e-8 else f"optimal up to {residual:.1e}"

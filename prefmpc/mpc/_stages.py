@@ -72,7 +72,8 @@ class StageProgram:
         dynamics = sp.hstack([sp.kron(back, self._A) - sp.kron(steps, np.eye(system.nx)),
                               sp.vstack(forcing)])
         self.rows = sp.csc_matrix(sp.vstack([dynamics, limits]))
-        self._rows_by_columns = sp.csr_matrix(self.rows.T)
+        conditions = sp.block_array([[self.P, self.rows.T], [self.rows, None]])
+        self._conditions = sp.csr_matrix(conditions)
         self.equations = (horizon + 1) * system.nx
 
     def _limits(
@@ -149,9 +150,8 @@ class StageProgram:
 
     def _at_most(self, bounds: Bounds, z: np.ndarray, y: np.ndarray) -> float:
         """Return what the residual cannot exceed; all that an exact answer has to pass."""
-        at = self.rows @ z
-        slope = self.P @ z
-        slope += self._rows_by_columns @ y
+        both = self._conditions @ np.concatenate([z, y])
+        slope, at = both[: len(z)], both[len(z) :]
         beyond = np.maximum(at - bounds.upper, bounds.lower - at)
         told = y.nonzero()[0]
         w, at = y[told], at[told]

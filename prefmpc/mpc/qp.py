@@ -14,7 +14,7 @@ from jax.typing import ArrayLike
 from prefmpc._checks import positive_int
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc._cone import PROVEN, SOLVED, TIGHT, ConeProgram, ConeSolution
-from prefmpc.mpc._refine import refined
+from prefmpc.mpc._refine import Refiner
 from prefmpc.mpc._stages import Bounds, StageProgram
 from prefmpc.mpc.solution import (
     Controller,
@@ -99,6 +99,7 @@ class LinearMPC(Controller):
         self._lock = threading.Lock()
         self._solver: Any = None
         self._backup: ConeProgram | None = None
+        self._refine: Refiner | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave out the solver, which is set up again when it is needed."""
@@ -178,8 +179,9 @@ class LinearMPC(Controller):
         residual = program.residual(bounds, z, y)
         if residual <= GOOD or not (np.isfinite(z).all() and np.isfinite(y).all()):
             return z, y, residual
-        nothing = np.zeros(len(z))
-        better = refined(program.P, nothing, program.rows, bounds.lower, bounds.upper, z, y)
+        if self._refine is None:
+            self._refine = Refiner(program.P, program.rows)
+        better = self._refine(np.zeros(len(z)), bounds.lower, bounds.upper, z, y)
         less = program.residual(bounds, *better)
         return (*better, less) if less < residual else (z, y, residual)
 
