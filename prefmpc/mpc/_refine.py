@@ -62,7 +62,7 @@ class Refiner:
             if not (np.isfinite(z).all() and np.isfinite(y).all()):
                 break
             at = self._rows @ z
-            slack = EXACT * max(1.0, float(np.abs(z).max(initial=0.0)))
+            slack = EXACT * np.maximum(1.0, np.abs(at))
             wrong = EXACT * float(np.abs(y).max(initial=0.0))
             over, under = ~same & (at > upper + slack), ~same & (at < lower - slack)
             leave = (high & (y < -wrong)) | (low & (y > wrong))

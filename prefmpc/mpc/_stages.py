@@ -174,12 +174,13 @@ class StageProgram:
         at, low, high = self._limits_by_rows @ z, *self._of_limits(bounds)
         room = np.where(w > 0, high - at, at - low)[w != 0]
         beyond = np.maximum(at - high, low - at) / np.maximum(FLOOR, np.abs(at))
+        worth = np.maximum(FLOOR, self.objective(z))
         parts = [
             _relative(on_x, slopes[0], L),
             _relative(on_u, slopes[1], drive),
             _relative(moved, X, X),
             beyond.max(initial=0.0),
-            np.abs(w[w != 0] * room).max(initial=0.0),
+            np.abs(w[w != 0] * room).max(initial=0.0) / worth,
         ]
         return float(np.max(parts))
 

@@ -9,10 +9,13 @@ import numpy as np
 from scipy.optimize import linprog
 
 from prefmpc._checks import instance, nonnegative, positive_int
+from prefmpc._pytree import bypass_init
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc.solution import check_dimension, check_problem
 from prefmpc.sets import Ellipsoid, Polyhedron
 from prefmpc.systems import LinearSystem, System
+
+ROUNDING = 1e-14
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -122,51 +125,66 @@ def terminal_ingredients(
         )
     K, P = system.lqr(cost.Q, cost.R)
     closed = system.A - system.B @ K
-    rows = Z.H[:, : system.nx] - Z.H[:, system.nx :] @ K  # what u = −K x leaves of Z
-    # A row that the feedback never meets bounds nothing.
-    rows, heights = rows[kept := np.abs(rows).max(axis=1) > 0], Z.h[kept]
-    reach = np.einsum("ri,ri->r", rows, np.linalg.solve(P, rows.T).T)
-    level = float((heights**2 / reach).min()) if len(rows) else np.inf
-    polyhedron = _maximal_invariant(closed, rows, heights, max_steps, tol)
-    return TerminalIngredients(P, K, polyhedron, Ellipsoid(P, level))
+    Hx, Hu = Z.H[:, : system.nx], Z.H[:, system.nx :]
+    rows = Hx - Hu @ K  # what u = −K x leaves of Z
+    # A row that the feedback meets by rounding alone bounds nothing.
+    kept = (np.abs(rows) > ROUNDING * (np.abs(Hx) + np.abs(Hu) @ np.abs(K))).any(axis=1)
+    rows, heights = rows[kept], Z.h[kept]
+    # In units in which P has ones on its diagonal and every limit is 1.
+    dx = 1 / np.sqrt(np.diag(P))
+    unit_rows = rows * dx / heights[:, None]
+    reach = np.einsum(
+        "ri,ri->r", unit_rows, np.linalg.solve(P * dx * dx[:, None], unit_rows.T).T
+    )
+    level = 1 / float(reach.max()) if len(rows) else np.inf
+    H = _maximal_invariant(closed * dx / dx[:, None], unit_rows, max_steps, tol)
+    # P is positive definite in its own units; in others no test by eigenvalues can tell.
+    ellipsoid = bypass_init(Ellipsoid, P=P, level=level)
+    return TerminalIngredients(P, K, Polyhedron(H / dx, np.ones(len(H))), ellipsoid)
 
 
 def _maximal_invariant(
-    closed: np.ndarray, rows: np.ndarray, heights: np.ndarray, max_steps: int, tol: float
-) -> Polyhedron:
-    """Return the largest set with rows @ x ≤ heights for x and all that follows from x⁺ = closed x.
+    closed: np.ndarray, rows: np.ndarray, max_steps: int, tol: float
+) -> np.ndarray:
+    """Return H of the largest set H x ≤ 1 with rows @ x ≤ 1 for x and all x⁺ = closed x after it.
 
     The algorithm of Gilbert and Tan: add the rows of one more step until they are redundant.
     """
-    if not len(rows):
-        return Polyhedron(np.zeros((0, len(closed))), np.zeros(0))
-    H, h, power = rows, heights, np.eye(len(closed))
-    for _ in range(max_steps):
+    H, power = rows, np.eye(len(closed))
+    for _ in range(max_steps if len(rows) else 0):
         power = power @ closed
-        new = [
-            (row, height)
-            for row, height in zip(rows @ power, heights, strict=True)
-            if _largest(row, H, h) > height * (1 + tol)
-        ]
+        new = [row for row in rows @ power if _largest(row, H) > 1 + tol]
         if not new:
-            return _without_redundant_rows(H, h, tol)
-        H = np.concatenate([H, [row for row, _ in new]])
-        h = np.concatenate([h, [height for _, height in new]])
+            return _without_redundant_rows(H, tol)
+        H = np.concatenate([H, new])
+    if not len(rows):
+        return H
     raise ValueError(
         f"max_steps must suffice to find the terminal polyhedron, it still grew after {max_steps}"
     )
 
 
-def _largest(row: np.ndarray, H: np.ndarray, h: np.ndarray) -> float:
-    """Return max row @ x over H x ≤ h; infinite if there is none."""
-    answer = linprog(-row, A_ub=H, b_ub=h, bounds=(None, None), method="highs")
-    return -float(answer.fun) if answer.status == 0 else np.inf
+def _largest(row: np.ndarray, H: np.ndarray) -> float:
+    """Return the smaller of 2 and max row @ x over H x ≤ 1."""
+    rows = np.concatenate([H, [row]])
+    unit = np.abs(rows).max(axis=0)
+    rows = rows / np.where(unit > 0, unit, 1.0)
+    # With an upper limit of its own there always is a maximum, so that any other end is an error.
+    limits = np.append(np.ones(len(H)), 2.0)
+    for method in ("highs", "highs-ipm"):
+        answer = linprog(-rows[-1], A_ub=rows, b_ub=limits, bounds=(None, None), method=method)
+        if answer.status == 0 and np.isfinite(answer.fun):
+            return -float(answer.fun)
+    raise ValueError(
+        "constraints must allow for a terminal polyhedron, but a linear program for it was not "
+        f"solved: {answer.message}"
+    )
 
 
-def _without_redundant_rows(H: np.ndarray, h: np.ndarray, tol: float) -> Polyhedron:
-    keep = np.ones(len(h), dtype=bool)
-    for i in range(len(h)):
+def _without_redundant_rows(H: np.ndarray, tol: float) -> np.ndarray:
+    keep = np.ones(len(H), dtype=bool)
+    for i in range(len(H)):
         keep[i] = False
-        if _largest(H[i], H[keep], h[keep]) > h[i] * (1 + tol):
+        if _largest(H[i], H[keep]) > 1 + tol:
             keep[i] = True
-    return Polyhedron(H[keep], h[keep])
+    return H[keep]
