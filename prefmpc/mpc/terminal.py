@@ -16,6 +16,8 @@ from prefmpc.sets import Ellipsoid, Polyhedron
 from prefmpc.systems import LinearSystem, System
 
 ROUNDING = 1e-14
+WIDE = 1e6
+"""States so many times beyond where the closest limit is are of no interest."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -165,20 +167,23 @@ def _maximal_invariant(
 
 
 def _largest(row: np.ndarray, H: np.ndarray) -> float:
-    """Return the smaller of 2 and max row @ x over H x ≤ 1."""
-    rows = np.concatenate([H, [row]])
-    unit = np.abs(rows).max(axis=0)
-    rows = rows / np.where(unit > 0, unit, 1.0)
-    # With an upper limit of its own there always is a maximum, so that any other end is an error.
-    limits = np.append(np.ones(len(H)), 2.0)
-    for method in ("highs", "highs-ipm"):
-        answer = linprog(-rows[-1], A_ub=rows, b_ub=limits, bounds=(None, None), method=method)
-        if answer.status == 0 and np.isfinite(answer.fun):
-            return -float(answer.fun)
-    raise ValueError(
-        "constraints must allow for a terminal polyhedron, but a linear program for it was not "
-        f"solved: {answer.message}"
+    """Return max row @ x over H x ≤ 1 and ‖x‖∞ ≤ `WIDE`, infinite if it is not found.
+
+    A row is left out only if it is shown to be redundant: one too many does no harm.
+    """
+    unit = np.abs(H).max(axis=0)
+    unit = np.where(unit > 0, unit, np.abs(row))
+    unit = np.where(unit > 0, unit, 1.0)
+    size = np.abs(row / unit).max()
+    answer = linprog(
+        -row / unit / size,
+        A_ub=H / unit,
+        b_ub=np.ones(len(H)),
+        bounds=(-WIDE, WIDE),
+        method="highs",
     )
+    found = answer.status == 0 and np.isfinite(answer.fun)
+    return -float(answer.fun) * float(size) if found else np.inf
 
 
 def _without_redundant_rows(H: np.ndarray, tol: float) -> np.ndarray:
