@@ -1,4 +1,4 @@
-"""Cone programs that Clarabel solves again and again, and that are judged by what they should be."""
+"""Cone programs that Clarabel solves again and again, each answer judged by its residual."""
 
 from __future__ import annotations
 
@@ -80,8 +80,9 @@ class ConeProgram:
         b: np.ndarray,
         cones: Sequence[Cone],
         options: dict[str, Any] | None = None,
+        good: float = GOOD,
     ) -> None:
-        self._options = options or {}
+        self._options, self._good = options or {}, good
         self._cones = [(kind, size) for kind, size in cones if size]
         A = sp.csr_matrix(A)
         biggest = np.asarray(abs(A).max(axis=1).todense()).ravel() if A.shape[0] else np.zeros(0)
@@ -179,7 +180,9 @@ class ConeProgram:
                     break
         z = found.z * unit
         scale = unit if self._mixed or not self._q.any() else 1.0
-        objective = float(0.5 * z @ (self._P @ z) + self._q @ z)
+        objective = np.nan
+        if found.status == "solved":
+            objective = float(0.5 * z @ (self._P @ z) + self._q @ z)
         return dataclasses.replace(
             found, z=z, y=found.y * self._per_row * scale, objective=objective, unit=unit
         )
@@ -214,7 +217,7 @@ class ConeProgram:
             return dataclasses.replace(found, residual=self._residual(found.z, found.y, q, b))
         z, y = found.z, found.y
         residual = self._residual(z, y, q, b)
-        if self._refine is not None and not residual <= GOOD and np.isfinite(residual):
+        if self._refine is not None and not residual <= self._good and np.isfinite(residual):
             low = np.where(self._equations, b, -np.inf)
             other = self._refine(q, low, b, z, y)
             if (less := self._residual(*other, q, b)) < residual:
@@ -227,6 +230,10 @@ class ConeProgram:
 
     def _residual(self, z: np.ndarray, y: np.ndarray, q: np.ndarray, b: np.ndarray) -> float:
         """Return the largest violation of the optimality conditions, relative to their terms."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            return self._violation(z, y, q, b)
+
+    def _violation(self, z: np.ndarray, y: np.ndarray, q: np.ndarray, b: np.ndarray) -> float:
         slope, pull, slack = self._P @ z, self._A_by_columns @ y, b - self._A @ z
         sizes = [np.abs(part).max(initial=1.0) for part in (slope, pull, q)]
         dual = np.abs(slope + pull + q).max(initial=0.0) / np.max(sizes)

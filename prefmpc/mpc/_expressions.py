@@ -57,8 +57,11 @@ def weights(cost: Any, nx: int, nu: int) -> tuple[np.ndarray, np.ndarray]:
     Exact for a quadratic σ. A network has the sizes of the signals in its ``scale``.
     """
     if isinstance(cost, SumCost):
-        pairs = [(w, weights(model, nx, nu)) for w, model in zip(cost.weights, cost.models)]
-        return sum(w * Q for w, (Q, _) in pairs), sum(w * R for w, (_, R) in pairs)
+        Q, R = np.zeros((nx, nx)), np.zeros((nu, nu))
+        for weight, model in zip(cost.weights, cost.models, strict=True):
+            parts = weights(model, nx, nu)
+            Q, R = Q + weight * parts[0], R + weight * parts[1]
+        return Q, R
     if isinstance(cost, QuadraticCost):
         return np.asarray(cost.Q), np.asarray(cost.R)
     steps = np.concatenate([np.eye(cost.columns), -np.eye(cost.columns), [np.zeros(cost.columns)]])

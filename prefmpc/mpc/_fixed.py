@@ -43,7 +43,8 @@ class FixedRows:
         maps.append(end.H[self.last] @ power)
         rows.append(end.H[self.last])
         limits.append(end.h[self.last])
-        self._map, self._rows, self._limits = map(np.concatenate, (maps, rows, limits))
+        self._map, self._rows = np.concatenate(maps), np.concatenate(rows)
+        self._limits = np.concatenate(limits)
         self._plant = system.A, system.B, input_size(system.u_min, system.u_max)
 
     def broken(self, x0: np.ndarray) -> bool:
@@ -62,14 +63,15 @@ class FixedCone:
 
     def __init__(self, system: LinearSystem, horizon: int, cone: SecondOrderCone) -> None:
         rows = np.concatenate([cone.F, cone.c[None]]) @ system.C
-        self.stage = unmoved(system.A, system.B, rows, None, horizon).all(axis=1)
+        self.stage = np.all(unmoved(system.A, system.B, rows, None, horizon), axis=1)
         self._cone, self._C = cone, system.C
         self._plant = system.A, system.B, input_size(system.u_min, system.u_max)
 
     def broken(self, x0: np.ndarray) -> bool:
         """Say whether it is broken there from x0 (nx,), by more than counts as on the limit."""
         cone, (A, B, u_size) = self._cone, self._plant
-        y_size = np.abs(self._C) @ np.maximum(np.abs(x0), np.abs(A) @ np.abs(x0) + np.abs(B) @ u_size)
+        step = np.abs(A) @ np.abs(x0) + np.abs(B) @ u_size
+        y_size = np.abs(self._C) @ np.maximum(np.abs(x0), step)
         size = np.linalg.norm(np.abs(cone.F) @ y_size + np.abs(cone.g)) + np.abs(cone.c) @ y_size
         x = x0
         for fixed in self.stage:

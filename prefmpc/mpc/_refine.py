@@ -83,9 +83,7 @@ class Refiner:
         data[self._diagonal] = np.concatenate([np.full(n, PROXIMAL), inner])
         entries = np.flatnonzero(data)
         starts = np.searchsorted(entries, self._starts).astype(np.int32)
-        factor = splu(
-            sp.csc_matrix((data[entries], self._i[entries], starts), shape=self._shape)
-        )
+        factor = splu(sp.csc_matrix((data[entries], self._i[entries], starts), shape=self._shape))
         best, left = (z, y), np.inf
         for _ in range(REFINEMENTS):
             rest = np.concatenate(

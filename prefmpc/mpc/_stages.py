@@ -69,8 +69,9 @@ class StageProgram:
         steps = sp.eye_array(horizon + 1)
         back = sp.eye_array(horizon + 1, k=-1)
         forcing = [sp.csc_array((system.nx, horizon * system.nu)), sp.kron(stages, self._B)]
-        dynamics = sp.hstack([sp.kron(back, self._A) - sp.kron(steps, np.eye(system.nx)),
-                              sp.vstack(forcing)])
+        dynamics = sp.hstack(
+            [sp.kron(back, self._A) - sp.kron(steps, np.eye(system.nx)), sp.vstack(forcing)]
+        )
         self.rows = sp.csc_matrix(sp.vstack([dynamics, limits]))
         conditions = sp.block_array([[self.P, self.rows.T], [self.rows, None]])
         self._conditions = sp.csr_matrix(conditions)
@@ -145,8 +146,9 @@ class StageProgram:
         Of the dynamics and of stationarity for each signal, relative to its size along the plan:
         a state that is large must not hide another one.
         """
-        quick = self._at_most(bounds, z, y)
-        return quick if quick <= ENOUGH else self._relative(bounds, z, y)
+        with np.errstate(invalid="ignore", over="ignore"):
+            quick = self._at_most(bounds, z, y)
+            return quick if quick <= ENOUGH else self._relative(bounds, z, y)
 
     def _at_most(self, bounds: Bounds, z: np.ndarray, y: np.ndarray) -> float:
         """Return what the residual cannot exceed; all that an exact answer has to pass."""

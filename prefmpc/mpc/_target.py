@@ -71,11 +71,9 @@ class Target:
         dx = self.sizes[:n]
         M = np.concatenate([self.A - np.eye(n), self.B], axis=1) * self.sizes / dx[:, None]
         right = self.right / dx
-        left, values, _ = np.linalg.svd(M)
-        size = values.max(initial=0.0)
         if self.keep is not None:
-            fixed = left[:, (values <= self.rank * size)].T
-            M = np.concatenate([M, np.concatenate([fixed, np.zeros((len(fixed), self.B.shape[1]))], axis=1)])
+            fixed = kept(self.A, self.B, self.sizes, self.rank) * dx
+            M = np.concatenate([M, np.pad(fixed, ((0, 0), (0, self.B.shape[1])))])
             right = np.concatenate([right, fixed @ (self.keep / dx)])
         z = np.linalg.lstsq(M, right, rcond=self.rank)[0]
         z += np.linalg.lstsq(M, right - M @ z, rcond=self.rank)[0]
@@ -87,6 +85,14 @@ class Target:
         return z, across[count:].T
 
 
+def kept(A: np.ndarray, B: np.ndarray, sizes: np.ndarray, rank: float = EXACT) -> np.ndarray:
+    """Return the combinations (k, nx) of states that stay what they are, whatever the input."""
+    dx = sizes[: len(A)]
+    M = np.concatenate([A - np.eye(len(A)), B], axis=1) * sizes / dx[:, None]
+    left, values, _ = np.linalg.svd(M)
+    return left[:, values <= rank * values.max(initial=0.0)].T / dx
+
+
 def input_sizes(A: Any, B: Any, C: Any, u_min: np.ndarray, u_max: np.ndarray) -> np.ndarray:
     """Return units (nx + nu,) of x and u: half the range of each input, and what that moves.
 
@@ -95,8 +101,7 @@ def input_sizes(A: Any, B: Any, C: Any, u_min: np.ndarray, u_max: np.ndarray) ->
     with np.errstate(invalid="ignore"):
         ranges = (u_max - u_min) / 2
     ranges = np.where(np.isfinite(ranges), ranges, 0.0)
-    moves, power = np.abs(B), np.abs(B)
-    effect, at = np.abs(C @ B), B
+    moves, effect, at = np.abs(B), np.abs(C @ B), B
     for _ in range(len(A)):
         at = A @ at
         moves, effect = np.maximum(moves, np.abs(at)), effect + np.abs(C @ at)
@@ -148,6 +153,7 @@ def _program(P: np.ndarray, q: np.ndarray, H: np.ndarray, h: np.ndarray) -> np.n
     free = sizes <= EXACT  # nothing moves these rows
     if (h[free] < -CONSISTENT * np.abs(h).max()).any():
         return None
-    found = ConeProgram(P, q, H[~free], h[~free], [("nonnegative", int((~free).sum()))], TIGHT)
-    answer = found.solve(h[~free])
+    cones = [("nonnegative", int((~free).sum()))]
+    program = ConeProgram(P, q, H[~free], h[~free], cones, TIGHT, good=0.0)
+    answer = program.solve(h[~free])
     return answer.z if answer.status == "solved" else None

@@ -10,8 +10,8 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from prefmpc._checks import instance, positive_int
-from prefmpc.models import QuadraticCost, SumCost
 from prefmpc._units import cost_units
+from prefmpc.models import QuadraticCost, SumCost
 from prefmpc.mpc._cone import ParametricProgram
 from prefmpc.mpc._expressions import (
     check_cones,
@@ -94,16 +94,15 @@ class ConvexMPC(Controller):
             point, terminal = terminal.x, None
         final, last = terminal_set(terminal, system.nx, ellipsoid=True)
         end = last if isinstance(last, Polyhedron) else None
-        rows = FixedRows(system, self.horizon, constraints, end)
-        cones = [FixedCone(system, self.horizon, cone) for cone in output_cones]
-        self._fixed = [rows, *cones]
+        self._rows = FixedRows(system, self.horizon, constraints, end)
+        self._cones = [FixedCone(system, self.horizon, cone) for cone in output_cones]
         weighing = weights(cost, system.nx, system.nu)
-        self._units = cost_units(
-            system.A, system.B, *weighing, final=final, steps=self.horizon
-        )
+        self._units = cost_units(system.A, system.B, *weighing, final=final, steps=self.horizon)
         self._build(constraints, output_cones, final, last, point)
 
-    def _build(self, constraints: Any, output_cones: Any, final: Any, last: Any, point: Any) -> None:
+    def _build(
+        self, constraints: Any, output_cones: Any, final: Any, last: Any, point: Any
+    ) -> None:
         """Set up the program in units in which the signals, and σ, are of order one."""
         import cvxpy
 
@@ -115,8 +114,7 @@ class ConvexMPC(Controller):
         states = cp.multiply(X, np.tile(dx, (N + 1, 1)))
         inputs = cp.multiply(U, np.tile(du, (N, 1)))
         total = expression(cp, self.cost, states[:-1], inputs)
-        rows, cones = self._fixed[0], self._fixed[1:]
-        left_out = rows.stage, [cone.stage for cone in cones]
+        rows, left_out = self._rows, (self._rows.stage, [cone.stage for cone in self._cones])
         limits = [
             X[0] == x0,
             X[1:] == X[:-1] @ A.T + U @ B.T,
@@ -144,7 +142,7 @@ class ConvexMPC(Controller):
         """
         state = check_single_state(x0, self.system.nx)
         began = time.perf_counter()
-        if any(limit.broken(state) for limit in self._fixed):
+        if self._rows.broken(state) or any(cone.broken(state) for cone in self._cones):
             return no_plan(self.system, self.horizon, "infeasible", fixed_message(state), began)
         dx, du = self._units
         found, (states, inputs) = self._program.solve(state / dx)

@@ -126,7 +126,8 @@ class LinearMPC(Controller):
         with self._lock:
             found = self._solved(bounds)
         plan = found.z * bounds.unit
-        found = dataclasses.replace(found, objective=program.objective(plan))
+        if found.status == "solved":
+            found = dataclasses.replace(found, objective=program.objective(plan))
         if reference is not None:
             plan = plan + program.origin(reference)
         states, inputs = program.split(plan)
@@ -194,7 +195,7 @@ class LinearMPC(Controller):
         if self._backup is None:
             by_rows = program.rows.tocsr()
             rows = sp.vstack([by_rows[equal], by_rows[above], -by_rows[below]])
-            cones = [("zero", program.equations), ("nonnegative", int((above.sum() + below.sum())))]
+            cones = [("zero", program.equations), ("nonnegative", int(above.sum() + below.sum()))]
             nothing = np.zeros(rows.shape[1]), np.zeros(rows.shape[0])
             self._backup = ConeProgram(program.P, nothing[0], rows, nothing[1], cones, TIGHT)
         found = self._backup.solve(np.concatenate([upper[equal], upper[above], -lower[below]]))

@@ -11,8 +11,8 @@ import scipy.linalg
 from jax.typing import ArrayLike
 
 from prefmpc._checks import finite_array, instance, nonnegative, shaped
-from prefmpc.models import QuadraticCost, SumCost
 from prefmpc._units import cost_units
+from prefmpc.models import QuadraticCost, SumCost
 from prefmpc.mpc._cone import ConeSolution, ParametricProgram
 from prefmpc.mpc._expressions import (
     check_cones,
@@ -184,17 +184,16 @@ class _Programs:
     ) -> None:
         import cvxpy
 
-        self._cp: Any = cvxpy
+        cp: Any = cvxpy
+        self._cp = cp
         dx, du = self._units = units
-        x, u = self._signals = cvxpy.Variable((1, system.nx)), cvxpy.Variable((1, system.nu))
-        self._moved = cvxpy.Parameter(system.nx)
+        x, u = self._signals = cp.Variable((1, system.nx)), cp.Variable((1, system.nu))
+        self._moved = cp.Parameter(system.nx)
         A, B = system.A * dx / dx[:, None], system.B * du / dx[:, None]
         self._still = x - x @ A.T - u @ B.T
-        scaled = cvxpy.multiply(x, dx[None]), cvxpy.multiply(u, du[None])
-        self._stage = expression(cvxpy, cost, *scaled)
-        self._limits = stage_limits(
-            cvxpy, system, constraints, output_cones, self._signals, units
-        )
+        scaled = cp.multiply(x, dx[None]), cp.multiply(u, du[None])
+        self._stage = expression(cp, cost, *scaled)
+        self._limits = stage_limits(cp, system, constraints, output_cones, self._signals, units)
 
     def steady(self) -> tuple[ConeSolution, np.ndarray, np.ndarray, np.ndarray]:
         """Return the solution, x, u, and the multiplier of x = A x + B u in own units."""

@@ -75,7 +75,10 @@ def steady_state(
     search = _held if isinstance(system, LinearSystem) else _search
     found = search(system, wanted, Z, x, u)
     if found is None:
-        raise ValueError(f"y_r must have a steady state, but none was found near y_r = {wanted}")
+        within = " within the constraints" if len(Z.h) else ""
+        raise ValueError(
+            f"y_r must have a steady state, but none was found{within} near y_r = {wanted}"
+        )
     if nearest or _reached(system, found, wanted):
         return found
     free = search(system, wanted, None, x, u)

@@ -135,9 +135,7 @@ def terminal_ingredients(
     # In units in which P has ones on its diagonal and every limit is 1.
     dx = 1 / np.sqrt(np.diag(P))
     unit_rows = rows * dx / heights[:, None]
-    reach = np.einsum(
-        "ri,ri->r", unit_rows, np.linalg.solve(P * dx * dx[:, None], unit_rows.T).T
-    )
+    reach = np.einsum("ri,ri->r", unit_rows, np.linalg.solve(P * dx * dx[:, None], unit_rows.T).T)
     level = 1 / float(reach.max()) if len(rows) else np.inf
     H = _maximal_invariant(closed * dx / dx[:, None], unit_rows, max_steps, tol)
     # P is positive definite in its own units; in others no test by eigenvalues can tell.
