@@ -131,34 +131,40 @@ def terminal_ingredients(
     rows = Hx - Hu @ K  # what u = −K x leaves of Z
     # A row that the feedback meets by rounding alone bounds nothing.
     kept = (np.abs(rows) > ROUNDING * (np.abs(Hx) + np.abs(Hu) @ np.abs(K))).any(axis=1)
+    kept &= np.isfinite(Z.h)
     rows, heights = rows[kept], Z.h[kept]
     # In units in which P has ones on its diagonal and every limit is 1.
-    dx = 1 / np.sqrt(np.diag(P))
+    dx = 1 / np.sqrt(np.where(np.diag(P) > 0, np.diag(P), 1.0))
+    # There, eigenvalues tell whether P is positive definite; in the user's units they need not.
+    unit_P = Ellipsoid(P * dx * dx[:, None]).P
     unit_rows = rows * dx / heights[:, None]
-    reach = np.einsum("ri,ri->r", unit_rows, np.linalg.solve(P * dx * dx[:, None], unit_rows.T).T)
+    reach = np.einsum("ri,ri->r", unit_rows, np.linalg.solve(unit_P, unit_rows.T).T)
     level = 1 / float(reach.max()) if len(rows) else np.inf
-    H = _maximal_invariant(closed * dx / dx[:, None], unit_rows, max_steps, tol)
-    # P is positive definite in its own units; in others no test by eigenvalues can tell.
-    ellipsoid = bypass_init(Ellipsoid, P=P, level=level)
-    return TerminalIngredients(P, K, Polyhedron(H / dx, np.ones(len(H))), ellipsoid)
+    H, of = _maximal_invariant(closed * dx / dx[:, None], unit_rows, max_steps, tol)
+    polyhedron = Polyhedron(H / dx * heights[of][:, None], heights[of])
+    ellipsoid = bypass_init(Ellipsoid, P=unit_P / dx / dx[:, None], level=level)
+    return TerminalIngredients(P, K, polyhedron, ellipsoid)
 
 
 def _maximal_invariant(
     closed: np.ndarray, rows: np.ndarray, max_steps: int, tol: float
-) -> np.ndarray:
+) -> tuple[np.ndarray, np.ndarray]:
     """Return H of the largest set H x ≤ 1 with rows @ x ≤ 1 for x and all x⁺ = closed x after it.
 
-    The algorithm of Gilbert and Tan: add the rows of one more step until they are redundant.
+    Also the row from which each row of H comes. The algorithm of Gilbert and Tan: add the rows of
+    one more step until they are redundant.
     """
-    H, power = rows, np.eye(len(closed))
-    for _ in range(max_steps if len(rows) else 0):
-        power = power @ closed
-        new = [row for row in rows @ power if _largest(row, H) > 1 + tol]
-        if not new:
-            return _without_redundant_rows(H, tol)
-        H = np.concatenate([H, new])
+    H, of, power = rows, np.arange(len(rows)), np.eye(len(closed))
     if not len(rows):
-        return H
+        return H, of
+    for _ in range(max_steps):
+        power = power @ closed
+        later = rows @ power
+        new = np.array([_largest(row, H) > 1 + tol for row in later])
+        if not new.any():
+            keep = _needed(H, tol)
+            return H[keep], of[keep]
+        H, of = np.concatenate([H, later[new]]), np.concatenate([of, np.flatnonzero(new)])
     raise ValueError(
         f"max_steps must suffice to find the terminal polyhedron, it still grew after {max_steps}"
     )
@@ -184,10 +190,11 @@ def _largest(row: np.ndarray, H: np.ndarray) -> float:
     return -float(answer.fun) * float(size) if found else np.inf
 
 
-def _without_redundant_rows(H: np.ndarray, tol: float) -> np.ndarray:
+def _needed(H: np.ndarray, tol: float) -> np.ndarray:
+    """Say which rows of H x ≤ 1 are not redundant."""
     keep = np.ones(len(H), dtype=bool)
     for i in range(len(H)):
         keep[i] = False
         if _largest(H[i], H[keep]) > 1 + tol:
             keep[i] = True
-    return H[keep]
+    return keep
