@@ -9,6 +9,9 @@ import numpy as np
 # The cost-to-go of so many steps says how much a state matters; for a unit that is enough.
 STEPS = 20
 
+FARTHEST = 1e6
+"""No unit of a state is so many times larger than what a unit of what drives it does in a step."""
+
 
 def cost_units(
     A: np.ndarray,
@@ -37,6 +40,11 @@ def cost_units(
         P = (P + P.T) / 2
         S = R + B.T @ P @ B
     states, inputs = _inverse_roots(np.diag(P)), _inverse_roots(np.diag(S))
+    driven = np.maximum(
+        (np.abs(A - np.diag(np.diag(A))) * states).max(axis=1), (np.abs(B) * inputs).max(axis=1)
+    )
+    # A weight that is rounding would give a unit in which the state itself is rounding.
+    states = np.where(driven > 0, np.minimum(states, FARTHEST * driven), states)
     return completed_units(A, B, states, inputs)
 
 
@@ -71,3 +79,19 @@ def completed_units(
         sizes = np.where(sizes > 0, sizes, guess)
     sizes = np.where(sizes > 0, sizes, 1.0)
     return sizes[:n], sizes[n:]
+
+
+def matters(A: np.ndarray, Q: np.ndarray) -> np.ndarray:
+    """Say which states the cost xᵀQx sees, at once or later through others; a bool array (nx,)."""
+    seen = np.diag(Q) > 0
+    for _ in range(len(A)):
+        seen = seen | ((A != 0) & seen[:, None]).any(axis=0)
+    return seen
+
+
+def free_response(A: np.ndarray, x0: np.ndarray, steps: int) -> np.ndarray:
+    """Return x_0 … x_steps, shape (steps + 1, ...), without inputs."""
+    out = [x0]
+    for _ in range(steps):
+        out.append(A @ out[-1])
+    return np.stack(out)

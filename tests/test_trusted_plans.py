@@ -229,3 +229,23 @@ def test_trackers_and_batches_can_be_copied_and_pickled():
         wanted = controller.solve(x)
         for other in (pickle.loads(pickle.dumps(controller)), copy.deepcopy(controller)):
             np.testing.assert_allclose(other.solve(x).u, wanted.u, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("kind", [LinearMPC, ConvexMPC])
+@pytest.mark.parametrize("far", [1e3, 1e6, 1e9])
+def test_a_state_that_does_not_matter_hides_nothing(kind, far):
+    # A speed is damped; the position, which σ does not see, is far away, before a wall or not.
+    plant = LinearSystem([[0.9, 0], [0.1, 1]], [[1], [0]], dt=0.1, u_min=-1, u_max=1)
+    cost, x0 = QuadraticCost(np.diag([1.0, 0.0]), [[1.0]]), np.array([0.8, 0.0])
+    for wall in (None, 0.1):
+        near, away = (
+            kind(plant, cost, 10, constraints=wall and Polyhedron([[0, 1.0, 0]], [wall + p]))
+            for p in (0, far)
+        )
+        wanted = near.solve(x0).trajectory
+        moved = np.array([0, far])
+        answer = away.solve(x0 + moved)
+        np.testing.assert_allclose(answer.trajectory.u, wanted.u, atol=1e-14 * far + 1e-8)
+        np.testing.assert_allclose(
+            answer.trajectory.x, wanted.x + moved, rtol=1e-14, atol=1e-14 * far + 1e-8
+        )

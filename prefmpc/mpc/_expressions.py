@@ -51,6 +51,13 @@ def check_convex(cost: Any, nx: int, nu: int, horizon: int) -> None:
         )
 
 
+def quadratic(cost: Any) -> bool:
+    """Say whether a convex σ is a quadratic one, or a sum of these."""
+    if isinstance(cost, SumCost):
+        return all(map(quadratic, cost.models))
+    return isinstance(cost, QuadraticCost)
+
+
 def weights(cost: Any, nx: int, nu: int) -> tuple[np.ndarray, np.ndarray]:
     """Return Q and R that say how much a convex σ cares for states and inputs, roughly.
 

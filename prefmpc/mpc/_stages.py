@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from prefmpc._units import cost_units, power_of_two
+from prefmpc._units import cost_units, free_response, matters, power_of_two
 from prefmpc.mpc._expressions import per_unit
 from prefmpc.mpc._fixed import FixedRows
 from prefmpc.mpc.steady import SteadyState
@@ -24,14 +24,15 @@ ENOUGH = 1e-9
 
 @dataclasses.dataclass(frozen=True)
 class Bounds:
-    """What changes between two solves: the limits of all rows, and the unit of the plan.
+    """What changes between two solves: the limits of all rows, the unit of the plan, its origin.
 
-    The first nx rows are −x_0, as lower and upper limit.
+    The first nx rows are −x_0, as lower and upper limit. The plan is ``unit`` z + ``origin``.
     """
 
     lower: np.ndarray
     upper: np.ndarray
     unit: float
+    origin: np.ndarray | None
 
 
 class StageProgram:
@@ -59,7 +60,8 @@ class StageProgram:
         self._Q, self._R = 2 * Q * dx * dx[:, None], 2 * R * du * du[:, None]
         end = np.zeros_like(Q) if final is None else final
         self._last = 2 * end * dx * dx[:, None]
-        self._matters = _matter(self._A, self._Q + self._last)
+        self._aside = ~matters(self._A, self._Q + self._last)
+        self._still = np.zeros(horizon * system.nu)
         stages = sp.eye_array(horizon)
         P = [sp.kron(stages, self._Q), sp.csc_array(self._last), sp.kron(stages, self._R)]
         self.P = sp.csc_matrix(sp.block_diag(P))
@@ -107,15 +109,24 @@ class StageProgram:
         """Return the limits for the state x0 (nx,), of deviations from the reference if any.
 
         The unit is how far z = 0 is from x_0 and from the limits, so that small plans are as
-        exact as large ones: a power of 2.
+        exact as large ones: a power of 2. What σ does not see, such as a position far away, is
+        part of the origin, with what becomes of it without inputs.
         """
-        low, high, x = self._low, self._high, x0 / self.dx
+        low, high, x, origin = self._low, self._high, x0 / self.dx, None
         if reference is not None:
-            shift = self._limits_by_rows @ self.origin(reference)
-            low, high, x = low - shift, high - shift, (x0 - reference.x) / self.dx
+            r, u = reference.x / self.dx, reference.u / self.du
+            x, origin = x - r, np.concatenate([np.tile(r, self._N + 1), np.tile(u, self._N)])
+        aside = x * self._aside
+        if aside.any():
+            x = x - aside
+            drift = np.concatenate([free_response(self._A, aside, self._N).ravel(), self._still])
+            origin = drift if origin is None else origin + drift
+        if origin is not None:
+            shift = self._limits_by_rows @ origin
+            low, high = low - shift, high - shift
         unit = power_of_two(
             max(
-                float(np.abs(x * self._matters).max()),
+                float(np.abs(x).max()),
                 float(low.max(initial=0.0)),
                 -float(high.min(initial=0.0)),
             )
@@ -124,12 +135,7 @@ class StageProgram:
         lower[: x.size] = upper[: x.size] = x / -unit
         with np.errstate(over="ignore"):
             lower[self.equations :], upper[self.equations :] = low / unit, high / unit
-        return Bounds(lower, upper, unit)
-
-    def origin(self, reference: SteadyState) -> np.ndarray:
-        """Return the set point as a plan, in own units."""
-        x, u = reference.x / self.dx, reference.u / self.du
-        return np.concatenate([np.tile(x, self._N + 1), np.tile(u, self._N)])
+        return Bounds(lower, upper, unit, origin)
 
     def split(self, z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the states (N + 1, nx) and the inputs (N, nu) of z."""
@@ -203,11 +209,3 @@ def _relative(miss: np.ndarray, first: np.ndarray, second: np.ndarray) -> Any:
     """Return the largest miss (k, n) relative to the largest size of each column's terms."""
     sizes = np.maximum(np.abs(first).max(axis=0), np.abs(second).max(axis=0))
     return (np.abs(miss).max(axis=0) / np.maximum(sizes, FLOOR)).max()
-
-
-def _matter(A: np.ndarray, Q: np.ndarray) -> np.ndarray:
-    """Say which states σ sees, at once or through others."""
-    seen = np.diag(Q) > 0
-    for _ in range(len(A)):
-        seen = seen | ((A != 0) & seen[:, None]).any(axis=0)
-    return seen

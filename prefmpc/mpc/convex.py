@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from prefmpc._checks import instance, positive_int
-from prefmpc._units import cost_units
+from prefmpc._units import cost_units, free_response, matters
 from prefmpc.models import QuadraticCost, SumCost
 from prefmpc.mpc._cone import ParametricProgram
 from prefmpc.mpc._expressions import (
@@ -19,6 +19,7 @@ from prefmpc.mpc._expressions import (
     expression,
     factor,
     per_unit,
+    quadratic,
     stage_limits,
     weights,
 )
@@ -111,29 +112,40 @@ class ConvexMPC(Controller):
         x0 = cp.Parameter(system.nx)
         X, U = cp.Variable((N + 1, system.nx)), cp.Variable((N, system.nu))
         A, B = system.A * dx / dx[:, None], system.B * du / dx[:, None]
+        # What σ does not see, such as a position far away, is set aside with what becomes of it.
+        aside = self._unseen(final)
+        self._drift = free_response(A, np.diag(aside.astype(float)), N)
+        whole = X + cp.vstack([power @ x0 for power in self._drift]) if aside.any() else X
         states = cp.multiply(X, np.tile(dx, (N + 1, 1)))
         inputs = cp.multiply(U, np.tile(du, (N, 1)))
         total = expression(cp, self.cost, states[:-1], inputs)
         rows, left_out = self._rows, (self._rows.stage, [cone.stage for cone in self._cones])
         limits = [
-            X[0] == x0,
+            X[0] == cp.multiply(np.where(aside, 0.0, 1.0), x0),
             X[1:] == X[:-1] @ A.T + U @ B.T,
             *stage_limits(
-                cp, system, constraints, output_cones, (X[:-1], U), self._units, left_out
+                cp, system, constraints, output_cones, (whole[:-1], U), self._units, left_out
             ),
         ]
         if point is not None:
-            limits.append(X[N] == point / dx)
+            limits.append(whole[N] == point / dx)
         if final is not None:
             total += cp.sum_squares(factor(final).T @ states[N])
         if isinstance(last, Ellipsoid):
             root = factor(last.P).T * dx / np.sqrt(last.level)
             size = np.abs(root).max()
-            limits.append(cp.norm(root / size @ X[N], 2) <= 1 / size)
+            limits.append(cp.norm(root / size @ whole[N], 2) <= 1 / size)
         elif last is not None and not rows.last.all():
             H, h = per_unit(last.H[~rows.last] * dx, last.h[~rows.last])
-            limits.append(H @ X[N] <= h)
+            limits.append(H @ whole[N] <= h)
         self._program = ParametricProgram(cp.Problem(cp.Minimize(total), limits), x0, (X, U))
+
+    def _unseen(self, final: np.ndarray | None) -> np.ndarray:
+        """Say which states a quadratic σ does not see; a network may see all."""
+        if not quadratic(self.cost):
+            return np.zeros(self.system.nx, dtype=bool)
+        Q = weights(self.cost, self.system.nx, self.system.nu)[0]
+        return ~matters(self.system.A, Q if final is None else Q + final)
 
     def solve(self, x0: ArrayLike) -> MPCSolution:
         """Solve for the state x0 (nx,); see `MPCSolution`. Raises a ValueError on a bad x0.
@@ -146,4 +158,5 @@ class ConvexMPC(Controller):
             return no_plan(self.system, self.horizon, "infeasible", fixed_message(state), began)
         dx, du = self._units
         found, (states, inputs) = self._program.solve(state / dx)
+        states = states + self._drift @ (state / dx)
         return mpc_solution(self.system, state, states * dx, inputs * du, found, began)

@@ -128,8 +128,8 @@ class LinearMPC(Controller):
         plan = found.z * bounds.unit
         if found.status == "solved":
             found = dataclasses.replace(found, objective=program.objective(plan))
-        if reference is not None:
-            plan = plan + program.origin(reference)
+        if bounds.origin is not None:
+            plan = plan + bounds.origin
         states, inputs = program.split(plan)
         solution = mpc_solution(
             self.system, x0, states * program.dx, inputs * program.du, found, began
