@@ -52,6 +52,8 @@ def test_steady_states_by_linear_algebra():
         np.testing.assert_allclose(np.concatenate([found.x, found.u]), z, atol=1e-6)
         np.testing.assert_allclose(found.y, y_r, atol=1e-6)
         assert held(MASSES, found) < 1e-8
+    found = steady_state(MASSES, [0, 0.1, 0.2])  # one of them zero, but for rounding
+    np.testing.assert_allclose(found.y, [0, 0.1, 0.2], atol=1e-15)
 
 
 def test_of_several_steady_states_the_smallest():

@@ -109,8 +109,7 @@ def check_reference(
     drift = np.abs(np.asarray(system.step(reference.x, reference.u)) - reference.x)
     size: Any = 1 + np.abs(z).max()
     if isinstance(system, LinearSystem):
-        units = input_sizes(system.A, system.B, system.C, system.u_min, system.u_max)
-        size = np.maximum(np.abs(reference.x), units[: system.nx] * np.abs(z / units).max())
+        size = _typical(system, reference)[: system.nx]
     if not (drift <= REACHED * size).all():
         raise ValueError(
             f"reference must be a steady state, but its next state moves by {drift.max()}"
@@ -128,10 +127,18 @@ def with_reference(solution: MPCSolution, reference: SteadyState | None) -> MPCS
     )
 
 
+def _typical(system: LinearSystem, held: SteadyState) -> np.ndarray:
+    """Return sizes (nx + nu,) of x and u next to which a share of `REACHED` is nothing."""
+    z = np.abs(np.concatenate([held.x, held.u]))
+    units = input_sizes(system.A, system.B, system.C, system.u_min, system.u_max)
+    return np.maximum(z, units * (z / units).max())
+
+
 def _reached(system: System, found: SteadyState, wanted: np.ndarray) -> bool:
-    """Say whether the output is the wanted one, each to a share of its own size."""
+    """Say whether the output is the wanted one, each to a share of the size that it can have."""
     if isinstance(system, LinearSystem):
-        size = np.maximum(np.abs(wanted), np.abs(system.C) @ np.abs(found.x))
+        typical = _typical(system, found)[: system.nx]
+        size = np.maximum(np.abs(wanted), np.abs(system.C) @ typical)
     else:
         size = 1 + np.abs(wanted).max() + np.zeros(wanted.size)
     return bool((np.abs(found.y - wanted) <= REACHED * size).all())
