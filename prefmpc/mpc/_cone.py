@@ -137,8 +137,8 @@ class ConeProgram:
         nothing = np.zeros(self._A.shape[0])
         return clarabel.DefaultSolver(upper, self._q, self._A, nothing, cones, settings)
 
-    def unit(self, b: np.ndarray) -> float:
-        """Return how far z = 0 is from feasible, as a power of 2: the unit in which z is solved."""
+    def _far(self, b: np.ndarray) -> float:
+        """Return how far z = 0 is from feasible: about the size of z."""
         far = 0.0
         for kind, part in self._parts():
             own = b[part]
@@ -153,15 +153,16 @@ class ConeProgram:
             far = max(far, float(miss))
         if self._mixed:  # with a linear cost z is not in proportion to b
             far = max(far, 1e-3 * float(np.abs(self._q).max()))
-        return power_of_two(far)
+        return far
 
     def solve(self, b: np.ndarray) -> ConeSolution:
         """Solve for another b, same shape; never raises, the status says how it went."""
         b = b * self._per_row
-        nothing = np.zeros(len(self._q)), np.zeros(len(b))
-        if self._residual(*nothing, self._q, b) == 0:
+        far = self._far(b)
+        if far == 0 and not self._q.any():
+            nothing = np.zeros(len(self._q)), np.zeros(len(b))
             return ConeSolution(*nothing, 0.0, "solved", "optimal", 0, 0.0)
-        unit = self.unit(b)
+        unit = power_of_two(far)
         q = self._q / unit if self._mixed else self._q
         b = b / unit
         near = b.copy()

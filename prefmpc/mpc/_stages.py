@@ -61,11 +61,13 @@ class StageProgram:
         end = np.zeros_like(Q) if final is None else final
         self._last = 2 * end * dx * dx[:, None]
         self._aside = ~matters(self._A, self._Q + self._last)
+        self._some_aside = bool(self._aside.any())
         self._still = np.zeros(horizon * system.nu)
         stages = sp.eye_array(horizon)
         P = [sp.kron(stages, self._Q), sp.csc_array(self._last), sp.kron(stages, self._R)]
         self.P = sp.csc_matrix(sp.block_diag(P))
         limits, self._low, self._high = self._limits(system, constraints, terminal)
+        self._far = _beyond(self._low, self._high)
         self._limits_by_rows = sp.csr_matrix(limits)
         self._limits_by_columns = sp.csr_matrix(limits.T)
         steps = sp.eye_array(horizon + 1)
@@ -116,21 +118,16 @@ class StageProgram:
         if reference is not None:
             r, u = reference.x / self.dx, reference.u / self.du
             x, origin = x - r, np.concatenate([np.tile(r, self._N + 1), np.tile(u, self._N)])
-        aside = x * self._aside
-        if aside.any():
+        if self._some_aside and (aside := x * self._aside).any():
             x = x - aside
             drift = np.concatenate([free_response(self._A, aside, self._N).ravel(), self._still])
             origin = drift if origin is None else origin + drift
+        far = self._far
         if origin is not None:
             shift = self._limits_by_rows @ origin
             low, high = low - shift, high - shift
-        unit = power_of_two(
-            max(
-                float(np.abs(x).max()),
-                float(low.max(initial=0.0)),
-                -float(high.min(initial=0.0)),
-            )
-        )
+            far = _beyond(low, high)
+        unit = power_of_two(max(float(np.abs(x).max()), far))
         lower, upper = np.zeros((2, self.rows.shape[0]))
         lower[: x.size] = upper[: x.size] = x / -unit
         with np.errstate(over="ignore"):
@@ -203,6 +200,11 @@ class StageProgram:
 
     def _of_limits(self, bounds: Bounds) -> tuple[np.ndarray, np.ndarray]:
         return bounds.lower[self.equations :], bounds.upper[self.equations :]
+
+
+def _beyond(low: np.ndarray, high: np.ndarray) -> float:
+    """Return how far 0 is beyond the limits, 0 within."""
+    return max(float(low.max(initial=0.0)), -float(high.min(initial=0.0)))
 
 
 def _relative(miss: np.ndarray, first: np.ndarray, second: np.ndarray) -> Any:

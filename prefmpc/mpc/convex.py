@@ -114,8 +114,9 @@ class ConvexMPC(Controller):
         A, B = system.A * dx / dx[:, None], system.B * du / dx[:, None]
         # What σ does not see, such as a position far away, is set aside with what becomes of it.
         aside = self._unseen(final)
+        self._aside = bool(aside.any())
         self._drift = free_response(A, np.diag(aside.astype(float)), N)
-        whole = X + cp.vstack([power @ x0 for power in self._drift]) if aside.any() else X
+        whole = X + cp.vstack([power @ x0 for power in self._drift]) if self._aside else X
         states = cp.multiply(X, np.tile(dx, (N + 1, 1)))
         inputs = cp.multiply(U, np.tile(du, (N, 1)))
         total = expression(cp, self.cost, states[:-1], inputs)
@@ -158,5 +159,7 @@ class ConvexMPC(Controller):
             return no_plan(self.system, self.horizon, "infeasible", fixed_message(state), began)
         dx, du = self._units
         found, (states, inputs) = self._program.solve(state / dx)
-        states = states + self._drift @ (state / dx)
-        return mpc_solution(self.system, state, states * dx, inputs * du, found, began)
+        if self._aside:
+            states = states + self._drift @ (state / dx)
+        plan = states * dx, inputs * du
+        return mpc_solution(self.system, state, plan, found.objective, found, began)

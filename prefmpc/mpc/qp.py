@@ -37,6 +37,7 @@ _SETTINGS = {
     "eps_prim_inf": 1e-8,
     "polishing": True,
     "max_iter": 20_000,
+    "check_termination": 10,
     "verbose": False,
 }
 
@@ -126,13 +127,12 @@ class LinearMPC(Controller):
         with self._lock:
             found = self._solved(bounds)
         plan = found.z * bounds.unit
-        if found.status == "solved":
-            found = dataclasses.replace(found, objective=program.objective(plan))
+        cost = program.objective(plan) if found.status == "solved" else np.nan
         if bounds.origin is not None:
             plan = plan + bounds.origin
         states, inputs = program.split(plan)
         solution = mpc_solution(
-            self.system, x0, states * program.dx, inputs * program.du, found, began
+            self.system, x0, (states * program.dx, inputs * program.du), cost, found, began
         )
         return with_reference(solution, reference)
 

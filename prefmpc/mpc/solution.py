@@ -166,16 +166,16 @@ def no_plan(
 def mpc_solution(
     system: LinearSystem,
     x0: np.ndarray,
-    states: np.ndarray,
-    inputs: np.ndarray,
+    plan: tuple[np.ndarray, np.ndarray],
+    cost: float,
     found: Any,
     began: float,
 ) -> MPCSolution:
     """Return the answer of a controller: the plan, or NaN and the reason why there is none.
 
-    ``found`` has the status, its message, the objective, the iterations and the residual.
+    ``plan`` is the states and inputs; ``found`` has status, message, iterations and residual.
     """
-    message, cost = found.message, found.objective
+    message, (states, inputs) = found.message, plan
     if found.status == "infeasible":
         message = infeasible_message(x0, len(inputs))
     if found.status != "solved":
