@@ -21,9 +21,13 @@ from prefmpc._checks import (
     single,
 )
 from prefmpc._pytree import Stack, register_pytree
+from prefmpc._units import cost_units
 
 if TYPE_CHECKING:
     import control
+
+RICCATI = 1e-8
+"""How far a solution of Riccati's equation may be off, relative to its largest entry."""
 
 
 class System:
@@ -225,22 +229,29 @@ class LinearSystem(System, Stack):
                 f"Q and R must have shapes {self.A.shape} and {(self.nu, self.nu)}, "
                 f"got {Q.shape} and {R.shape}"
             )
+        # In units in which Q, R and P are of order one: the solver loses digits in others.
+        dx, du = cost_units(self.A, self.B, Q, R)
+        A, B = self.A * dx / dx[:, None], self.B * du / dx[:, None]
+        Q, R = Q * dx * dx[:, None], R * du * du[:, None]
         try:
-            P = scipy.linalg.solve_discrete_are(self.A, self.B, Q, R)
-            K = np.linalg.solve(R + self.B.T @ P @ self.B, self.B.T @ P @ self.A)
-            radius = float(np.abs(np.linalg.eigvals(self.A - self.B @ K)).max())
-            if radius >= 1:
+            P = scipy.linalg.solve_discrete_are(A, B, Q, R)
+            K = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
+            radius = float(np.abs(np.linalg.eigvals(A - B @ K)).max())
+            if not radius < 1:
                 raise np.linalg.LinAlgError(f"the closed loop has radius {radius:.6g}")
+            miss = np.abs(Q + A.T @ P @ (A - B @ K) - P).max() / np.abs(P).max(initial=1e-300)
+            if not miss < RICCATI:
+                raise np.linalg.LinAlgError(f"Riccati's equation is missed by {miss:.1e}")
         except np.linalg.LinAlgError as error:
             # Only now: a mode that no input reaches stays in the closed loop, so this is caught.
-            mode = _unstabilisable_mode(self.A, self.B)
+            mode = _unstabilisable_mode(A, B)
             if mode is not None:
                 raise ValueError(
                     f"the pair (A, B) must be stabilisable, got a mode {mode:.4g} with "
                     f"|mode| = {abs(mode):.4g} that no input reaches"
                 ) from None
             raise ValueError(f"Q must see every undamped mode of A: {error}") from None
-        return K, P
+        return K * du[:, None] / dx, P / dx / dx[:, None]
 
 
 register_pytree(LinearSystem, static=("dt",))

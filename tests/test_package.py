@@ -112,7 +112,8 @@ LAYERS = {
     "_pytree": set(),
     "_random": {"_checks"},
     "_lbfgsb": set(),
-    "systems": HELPERS,
+    "_units": set(),
+    "systems": HELPERS | {"_units"},
     "sets": HELPERS,
     "trajectories": HELPERS | {"systems"},
     "pools": HELPERS | {"systems", "trajectories"},
@@ -144,7 +145,7 @@ LAYERS = {
     "early_stopping": HELPERS | {"trajectories", "models", "comparisons", "losses", "training"},
     "mpc": {
         *HELPERS,
-        *("systems", "nonlinear", "sets", "trajectories", "models", "networks", "mpc"),
+        *("_units", "systems", "nonlinear", "sets", "trajectories", "models", "networks", "mpc"),
     },
     "_sharding": HELPERS,
     "loops": {

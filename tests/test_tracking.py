@@ -52,6 +52,8 @@ def test_steady_states_by_linear_algebra():
         np.testing.assert_allclose(np.concatenate([found.x, found.u]), z, atol=1e-6)
         np.testing.assert_allclose(found.y, y_r, atol=1e-6)
         assert held(MASSES, found) < 1e-8
+    found = steady_state(MASSES, [0, 0.1, 0.2])  # one of them zero, but for rounding
+    np.testing.assert_allclose(found.y, [0, 0.1, 0.2], atol=1e-15)
 
 
 def test_of_several_steady_states_the_smallest():
@@ -259,3 +261,45 @@ LINEAR = LinearMPC(CARRIAGE, LIGHT, 3)
 def test_bad_input_is_named(call, words):
     with pytest.raises(ValueError, match=words):
         call()
+
+
+# x⁺ = x + 0.1 (u + d): a constant disturbance among the states.
+DISTURBED = LinearSystem([[1, 0.1], [0, 1]], [[0.1], [0]], [[1, 0]], dt=0.1, u_min=-1, u_max=1)
+
+
+def test_a_disturbance_is_taken_from_the_start():
+    found = steady_state(DISTURBED, [2.0], start=([0.0, 0.3], [0.0]))
+    np.testing.assert_allclose(found.x, [2.0, 0.3], rtol=1e-13)
+    np.testing.assert_allclose(found.u, [-0.3], rtol=1e-13)
+    np.testing.assert_allclose(steady_state(DISTURBED, [2.0]).x, [2, 0], atol=1e-15)
+    with pytest.raises(ValueError, match="steady state, but none was found within the constr"):
+        steady_state(DISTURBED, [2.0], start=([0, 1.5], [0]))
+    with pytest.raises(ValueError, match="none was found"):  # nothing stops what drifts by itself
+        steady_state(LinearSystem([[1, 1], [0, 1]], [[0], [0]], dt=1), [0, 0], start=([0, 1], [0]))
+
+
+def test_the_tracker_sees_the_disturbance_in_the_state():
+    tracker = ReferenceTracker(
+        LinearMPC(DISTURBED, QuadraticCost(np.diag([1.0, 0]), [[0.1]]), 20), [1.0]
+    )
+    for d in (0.3, -0.5):
+        T = simulate(DISTURBED, tracker, np.array([0.0, d]), 150)
+        assert T.x[-1, 0] == pytest.approx(1, abs=1e-9)
+        assert T.u[-1, 0] == pytest.approx(-d, abs=1e-8)
+        np.testing.assert_allclose(tracker.reference.u, [-d], atol=1e-12)
+    with pytest.raises(MPCError, match="infeasible: y_r must have a steady state"):
+        tracker([0.0, 1.5])
+    assert tracker.solve([0.0, 0.3]).success
+
+
+@pytest.mark.parametrize("unit", [1e-9, 1e-5, 1e-4, 1e-3, 1e6])
+def test_set_points_in_any_unit_of_the_output(unit):
+    plant = LinearSystem([[1, 0.2], [0, 1]], [[0.02], [0.2]], [[unit, 0]], dt=0.2)
+    for y in (20.0, 0.1, 1e-9):
+        found = steady_state(plant, [y * unit])
+        np.testing.assert_allclose(found.x, [y, 0], rtol=1e-13, atol=1e-13 * y)
+        np.testing.assert_allclose(found.u, 0, atol=1e-13 * y)
+    held = LinearSystem([[0.5]], [[1.0]], [[unit]], dt=1, u_min=-1, u_max=1)
+    with pytest.raises(ValueError, match="outside of the constraints: holding it takes x = "):
+        steady_state(held, [3 * unit])
+    assert steady_state(held, [3 * unit], nearest=True).y[0] == pytest.approx(2 * unit, rel=1e-12)

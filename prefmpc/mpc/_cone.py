@@ -1,31 +1,39 @@
-"""Convex σ as cvxpy expressions, and cone programs that Clarabel solves again and again."""
+"""Cone programs that Clarabel solves again and again, each answer judged by its residual."""
 
 from __future__ import annotations
 
 import dataclasses
-import time
+import threading
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
-from prefmpc._checks import instance, nonnegative, sequence
-from prefmpc.models import QuadraticCost, SumCost
-from prefmpc.mpc.solution import MPCSolution, check_dimension, infeasible_message, predicted
-from prefmpc.mpc.terminal import stage_constraints
-from prefmpc.networks import ICNNCost
-from prefmpc.sets import SecondOrderCone
-from prefmpc.systems import LinearSystem
+from prefmpc._units import power_of_two
+from prefmpc.mpc._refine import Refiner
 
-# Clarabel calls a point "almost solved" when it gets no further than the reduced tolerances.
+# Clarabel calls a point "almost solved" when it gets no further than the reduced tolerances. It
+# has no say in what counts as solved here: that is the residual below.
 _TOLERANCES = {
     **{"tol_gap_abs": 1e-8, "tol_gap_rel": 1e-8, "tol_feas": 1e-8},
     **{"reduced_tol_gap_abs": 1e-6, "reduced_tol_gap_rel": 1e-6, "reduced_tol_feas": 1e-6},
 }
 
-TIGHT = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9}
+TIGHT = {"tol_gap_abs": 1e-11, "tol_gap_rel": 1e-11, "tol_feas": 1e-10}
 """Where there is hardly any room u is sensitive; only exponential cones do not reach this."""
+
+SOLVED = 1e-7
+"""The largest residual of a solution."""
+
+GOOD = 1e-11
+"""A residual that needs no improvement."""
+
+PROVEN = 1e-4
+"""How exact a proof of infeasibility must be: it holds for all plans up to 1 / PROVEN units."""
+
+FAR = 1e6
+"""Limits so many units away are as good as none, and would only drown the others."""
 
 # About one exponential-cone program in 2000 stops at a residual of 1e-6, by an unlucky rounding:
 # other steps arrive.
@@ -34,51 +42,34 @@ _SECOND_TRIES: tuple[dict[str, Any], ...] = (
     {"equilibrate_enable": False},
 )
 
+Cone = tuple[str, int]
+"""A kind ("zero", "nonnegative", "second_order" or "exponential"), and a number of rows."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ConeSolution:
-    """What Clarabel found; ``residual`` is the largest of its residuals and relative gap."""
+    """A point, its multipliers, what Clarabel says of it, and the residual that is computed here.
+
+    ``residual`` is the largest violation of the optimality conditions, in units of the problem;
+    with the status "infeasible" that of the proof. ``unit`` is the size of z for which it was
+    solved.
+    """
 
     z: np.ndarray
+    y: np.ndarray
     objective: float
     status: str
     message: str
     iterations: int
     residual: float
-
-
-def mpc_solution(
-    system: LinearSystem,
-    x0: np.ndarray,
-    states: np.ndarray,
-    inputs: np.ndarray,
-    found: ConeSolution,
-    began: float,
-) -> MPCSolution:
-    """Return the answer of a controller: the plan, or NaN and the reason why there is none."""
-    message, cost = found.message, found.objective
-    if found.status == "infeasible":
-        message = infeasible_message(x0, len(inputs))
-    if found.status != "solved":
-        states, inputs = np.full_like(states, np.nan), np.full_like(inputs, np.nan)
-        cost = np.nan
-    inputs = np.clip(inputs, system.u_min, system.u_max)
-    return MPCSolution(
-        u=inputs[0],
-        trajectory=predicted(system, states, inputs),
-        cost=cost,
-        status=found.status,
-        message=message,
-        iterations=found.iterations,
-        residual=found.residual,
-        seconds=time.perf_counter() - began,
-    )
+    unit: float = 1.0
 
 
 class ConeProgram:
     """min ½ zᵀPz + qᵀz subject to b − A z in a product of cones; only b changes between solves.
 
-    Set up once: a new b keeps scaling, ordering and symbolic factorisation.
+    Set up once: a new b keeps ordering and symbolic factorisation. Every problem is solved in the
+    unit in which its z is of order one. Several threads may use the same program, in turns.
     """
 
     def __init__(
@@ -87,12 +78,45 @@ class ConeProgram:
         q: np.ndarray,
         A: Any,
         b: np.ndarray,
-        cones: Sequence[Any],
+        cones: Sequence[Cone],
         options: dict[str, Any] | None = None,
+        good: float = GOOD,
     ) -> None:
-        self._options = options or {}
-        self._data = sp.triu(P, format="csc"), q, sp.csc_matrix(A), b, list(cones)
-        self._solver = self._new_solver({})
+        self._options, self._good = options or {}, good
+        self._cones = [(kind, size) for kind, size in cones if size]
+        A = sp.csr_matrix(A)
+        biggest = np.asarray(abs(A).max(axis=1).todense()).ravel() if A.shape[0] else np.zeros(0)
+        for kind, part in self._parts():
+            if kind not in ("zero", "nonnegative"):
+                biggest[part] = biggest[part].max()
+        self._per_row = 1 / np.where(biggest > 0, biggest, 1.0)
+        self._P, self._q = sp.csc_matrix(P), np.asarray(q, dtype=np.float64)
+        self._A = sp.csc_matrix(sp.diags_array(self._per_row) @ A)
+        self._A_by_columns = sp.csr_matrix(self._A.T)
+        self._equations = np.zeros(len(b), dtype=bool)
+        for kind, part in self._parts():
+            self._equations[part] = kind == "zero"
+        flat = all(kind in ("zero", "nonnegative") for kind, _ in self._cones)
+        self._refine = Refiner(self._P, self._A) if flat else None
+        self._mixed = bool(self._P.count_nonzero() and self._q.any())
+        self._solver: Any = None
+        self._lock = threading.Lock()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the solver, which is set up again when it is needed."""
+        return {k: v for k, v in self.__dict__.items() if k not in ("_solver", "_lock")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over what was pickled or copied."""
+        self.__dict__.update(state, _solver=None, _lock=threading.Lock())
+
+    def _parts(self) -> list[tuple[str, slice]]:
+        """Return the kind of every cone and its rows."""
+        parts, at = [], 0
+        for kind, size in self._cones:
+            parts.append((kind, slice(at, at + size)))
+            at += size
+        return parts
 
     def _new_solver(self, options: dict[str, Any]) -> Any:
         import clarabel
@@ -102,34 +126,152 @@ class ConeProgram:
         settings.presolve_enable = False  # it may drop rows, which then cannot be changed
         for name, value in {**_TOLERANCES, **self._options, **options}.items():
             setattr(settings, name, value)
-        return clarabel.DefaultSolver(*self._data, settings)
+        kinds = {
+            "zero": clarabel.ZeroConeT,
+            "nonnegative": clarabel.NonnegativeConeT,
+            "second_order": clarabel.SecondOrderConeT,
+            "exponential": lambda _: clarabel.ExponentialConeT(),
+        }
+        cones = [kinds[kind](size) for kind, size in self._cones]
+        upper = sp.triu(self._P, format="csc")
+        nothing = np.zeros(self._A.shape[0])
+        return clarabel.DefaultSolver(upper, self._q, self._A, nothing, cones, settings)
+
+    def _far(self, b: np.ndarray) -> float:
+        """Return how far z = 0 is from feasible: about the size of z."""
+        far = 0.0
+        for kind, part in self._parts():
+            own = b[part]
+            if kind == "zero":
+                miss = np.abs(own).max()
+            elif kind == "nonnegative":
+                miss = -own.min()
+            elif kind == "second_order":
+                miss = np.linalg.norm(own[1:]) - own[0]
+            else:  # the size of an exponential is not to be chosen
+                miss = 1.0
+            far = max(far, float(miss))
+        if self._mixed:  # with a linear cost z is not in proportion to b
+            far = max(far, 1e-3 * float(np.abs(self._q).max()))
+        return far
 
     def solve(self, b: np.ndarray) -> ConeSolution:
         """Solve for another b, same shape; never raises, the status says how it went."""
-        found = self._run(self._solver, b)
-        for options in _SECOND_TRIES:
-            if found.status != "failed":
-                break
-            found = self._run(self._new_solver(options), b)
-        return found
+        b = b * self._per_row
+        far = self._far(b)
+        if far == 0 and not self._q.any():
+            nothing = np.zeros(len(self._q)), np.zeros(len(b))
+            return ConeSolution(*nothing, 0.0, "solved", "optimal", 0, 0.0)
+        unit = power_of_two(far)
+        q = self._q / unit if self._mixed else self._q
+        b = b / unit
+        near = b.copy()
+        for kind, part in self._parts():
+            if kind == "nonnegative":
+                near[part] = np.minimum(near[part], FAR)
+        with self._lock:
+            if self._solver is None:
+                self._solver = self._new_solver({})
+            for options in (None, *_SECOND_TRIES):
+                solver = self._solver if options is None else self._new_solver(options)
+                if self._mixed:
+                    solver.update(q=q)
+                found = self._judged(self._run(solver, near), q, b)
+                if found.status != "failed":
+                    break
+        z = found.z * unit
+        scale = unit if self._mixed or not self._q.any() else 1.0
+        objective = np.nan
+        if found.status == "solved":
+            objective = float(0.5 * z @ (self._P @ z) + self._q @ z)
+        return dataclasses.replace(
+            found, z=z, y=found.y * self._per_row * scale, objective=objective, unit=unit
+        )
 
     @staticmethod
     def _run(solver: Any, b: np.ndarray) -> ConeSolution:
         solver.update(b=b)
         found = solver.solve()
         said = str(found.status)
-        status = {"Solved": "solved", "AlmostSolved": "solved", "PrimalInfeasible": "infeasible"}
-        gap = abs(found.obj_val - found.obj_val_dual) / max(1.0, abs(found.obj_val))
-        residual = float(max(found.r_prim, found.r_dual, gap))
-        messages = {"Solved": "optimal", "AlmostSolved": f"optimal up to {residual:.1e}"}
+        # Whether a point at which it got stuck is good enough, its residual says.
+        status = dict.fromkeys(("Solved", "AlmostSolved", "InsufficientProgress"), "solved")
+        status["PrimalInfeasible"] = "infeasible"
         return ConeSolution(
-            z=np.asarray(found.x),
-            objective=float(found.obj_val),
+            z=np.array(found.x),
+            y=np.array(found.z),
+            objective=np.nan,
             status=status.get(said, "failed"),
-            message=messages.get(said, f"Clarabel says {said!r}"),
+            message="optimal" if said == "Solved" else f"Clarabel says {said!r}",
             iterations=int(found.iterations),
-            residual=residual,
+            residual=np.nan,
         )
+
+    def _judged(self, found: ConeSolution, q: np.ndarray, b: np.ndarray) -> ConeSolution:
+        """Return the same, improved where that is possible, with a status that its numbers bear."""
+        if found.status == "infeasible":
+            doubt = self._doubt(found.y, b)
+            if doubt <= PROVEN:
+                return dataclasses.replace(found, residual=doubt)
+            note = f"{found.message}, with a proof that is off by {doubt:.1e}"
+            return dataclasses.replace(found, status="failed", message=note, residual=doubt)
+        if found.status != "solved":
+            return dataclasses.replace(found, residual=self._residual(found.z, found.y, q, b))
+        z, y = found.z, found.y
+        residual = self._residual(z, y, q, b)
+        if self._refine is not None and not residual <= self._good and np.isfinite(residual):
+            low = np.where(self._equations, b, -np.inf)
+            other = self._refine(q, low, b, z, y)
+            if (less := self._residual(*other, q, b)) < residual:
+                (z, y), residual = other, less
+        if residual <= SOLVED:
+            note = "optimal" if residual <= 1e-8 else f"optimal up to {residual:.1e}"
+            return dataclasses.replace(found, z=z, y=y, residual=residual, message=note)
+        note = f"{found.message}, but the optimality conditions are missed by {residual:.1e}"
+        return dataclasses.replace(found, status="failed", message=note, residual=residual)
+
+    def _residual(self, z: np.ndarray, y: np.ndarray, q: np.ndarray, b: np.ndarray) -> float:
+        """Return the largest violation of the optimality conditions, relative to their terms."""
+        with np.errstate(invalid="ignore", over="ignore"):
+            return self._violation(z, y, q, b)
+
+    def _violation(self, z: np.ndarray, y: np.ndarray, q: np.ndarray, b: np.ndarray) -> float:
+        slope, pull, slack = self._P @ z, self._A_by_columns @ y, b - self._A @ z
+        sizes = [np.abs(part).max(initial=1.0) for part in (slope, pull, q)]
+        dual = np.abs(slope + pull + q).max(initial=0.0) / np.max(sizes)
+        worth = max(1.0, abs(0.5 * z @ slope + q @ z))
+        gap = abs(float(np.where(y == 0, 0.0, slack) @ y)) / worth
+        outside = [
+            [_outside(kind, slack[part]), _outside(kind, y[part], dual=True)]
+            for kind, part in self._parts()
+        ]
+        high, wrong = np.max(outside, axis=0, initial=0.0)
+        return float(np.max([dual, gap, high / max(1.0, np.abs(z).max()), wrong / np.max(sizes)]))
+
+    def _doubt(self, y: np.ndarray, b: np.ndarray) -> float:
+        """Return Aᵀy for a y in the dual cone, relative to −bᵀy: what a proof lacks; NaN if none.
+
+        0 > bᵀy ≥ (A z)ᵀy is impossible for any z with ‖z‖ · doubt < 1.
+        """
+        short = -float(b @ y)
+        wrong = np.max([0.0, *(_outside(k, y[part], dual=True) for k, part in self._parts())])
+        if not short > 0 or not wrong <= 1e-9 * np.abs(y).max():
+            return np.nan
+        return float(np.abs(self._A_by_columns @ y).sum() / short)
+
+
+def _outside(kind: str, s: np.ndarray, *, dual: bool = False) -> float:
+    """Return how far s is outside of a cone, or of its dual one: 0 inside, NaN for NaN."""
+    if kind == "zero":
+        return 0.0 * float(s.sum()) if dual else float(np.abs(s).max())
+    if kind == "nonnegative":
+        return float(np.maximum(-s, 0.0).max())
+    if kind == "second_order":
+        return float(np.maximum(np.linalg.norm(s[1:]) - s[0], 0.0))
+    # {b exp(a / b) ≤ c, b > 0} and its limits; the dual cone is the same one with other names.
+    a, b, c = s if not dual else (-s[1], -s[0], np.e * s[2])
+    if b > 0 and c > 0:
+        return float(np.maximum(a - b * np.log(c / b), 0.0))
+    return float(np.max([np.abs(b), -c, a, 0.0]))
 
 
 class ParametricProgram:
@@ -158,8 +300,14 @@ class ParametricProgram:
         size = len(data["c"])
         P = data.get("P", sp.csc_matrix((size, size)))
         dims = data["dims"]
+        # The cones of cvxpy's standard form, in its order.
+        cones = [
+            *(("zero", dims.zero), ("nonnegative", dims.nonneg)),
+            *(("second_order", size) for size in dims.soc),
+            *(("exponential", 3) for _ in range(dims.exp)),
+        ]
         options = {} if dims.exp else TIGHT
-        self._program = ConeProgram(P, data["c"], data["A"], self._base, _cones(dims), options)
+        self._program = ConeProgram(P, data["c"], data["A"], self._base, cones, options)
         first = data["param_prob"].var_id_to_col
         self._places = [(first[v.id], v.shape) for v in variables]
 
@@ -172,96 +320,6 @@ class ParametricProgram:
         ]
         return dataclasses.replace(found, objective=found.objective + self._offset), parts
 
-
-def _cones(dims: Any) -> list[Any]:
-    """Return the cones of cvxpy's standard form, in its order, as Clarabel wants them."""
-    import clarabel
-
-    return [
-        clarabel.ZeroConeT(dims.zero),
-        clarabel.NonnegativeConeT(dims.nonneg),
-        *(clarabel.SecondOrderConeT(size) for size in dims.soc),
-        *(clarabel.ExponentialConeT() for _ in range(dims.exp)),
-    ]
-
-
-def expression(cp: Any, cost: Any, X: Any, U: Any) -> Any:
-    """Return σ as a cvxpy expression of the states X (N, nx) and the inputs U (N, nu).
-
-    Raises a ValueError if ``cost`` is not a convex model, or does not fit.
-    """
-    if getattr(cost, "batch_shape", ()):
-        raise ValueError(f"cost must be a single model, got a stack of shape {cost.batch_shape}")
-    (N, nx), nu = X.shape, U.shape[1]
-    if isinstance(cost, SumCost):
-        parts = zip(cost.weights, cost.models, strict=True)
-        return sum(float(weight) * expression(cp, model, X, U) for weight, model in parts)
-    if isinstance(cost, QuadraticCost):
-        Q, R = np.asarray(cost.Q), np.asarray(cost.R)
-        if Q.shape != (nx, nx) or R.shape != (nu, nu):
-            raise ValueError(
-                f"cost must weigh {nx} states and {nu} inputs, got Q {Q.shape} and R {R.shape}"
-            )
-        return cp.sum_squares(X @ _factor(Q)) + cp.sum_squares(U @ _factor(R))
-    if not isinstance(cost, ICNNCost):
-        raise ValueError(
-            "cost must be a convex σ (QuadraticCost, ICNNCost, or SumCost of these), "
-            f"got {type(cost).__name__}"
-        )
-    for name, leaf in (*((f"U[{i}]", leaf) for i, leaf in enumerate(cost.U)), ("c", cost.c)):
-        if not (np.asarray(leaf) >= 0).all():
-            raise ValueError(f"cost must be convex, but its {name} has negative entries or NaN")
-    if len(cost.scale) != nx + nu:
-        raise ValueError(f"cost must see {nx + nu} signals, got {len(cost.scale)}")
-    nonnegative("cost.floor", cost.floor)
-    v = cp.multiply(cp.hstack([X, U]), np.tile(1 / np.asarray(cost.scale), (N, 1)))
-    if cost.over == "trajectory":
-        columns = np.shape(cost.V[0])[-1]
-        if columns != N * (nx + nu):
-            raise ValueError(
-                f"horizon must be {columns // (nx + nu)}, for which cost was made, got {N}"
-            )
-        v = cp.reshape(v, (1, columns), order="C")
-    act = {
-        "softplus": cp.logistic,
-        "relu": cp.pos,
-        "squared_relu": lambda a: cp.square(cp.pos(a)),
-    }[cost.activation]
-    ones = np.ones((v.shape[0], 1))
-
-    def units(v: Any) -> Any:
-        z = act(v @ np.asarray(cost.V[0]).T + ones @ np.asarray(cost.b[0])[None])
-        for V, b, W in zip(cost.V[1:], cost.b[1:], cost.U, strict=True):
-            z = act(z @ np.asarray(W).T + v @ np.asarray(V).T + ones @ np.asarray(b)[None])
-        return z
-
-    last = (units(v) + units(-v)) / 2 if cost.even else units(v)
-    total = cp.sum(last @ np.asarray(cost.c))
-    return total + cost.floor * cp.sum_squares(v) if cost.floor else total
-
-
-def stage_limits(
-    cp: Any, system: LinearSystem, constraints: Any, output_cones: Sequence[Any], X: Any, U: Any
-) -> list[Any]:
-    """Return (x, u) ∈ Z for every row of X (N, nx) and U (N, nu) as cvxpy constraints.
-
-    Raises a ValueError if a set does not fit.
-    """
-    Z = stage_constraints(system, constraints)
-    cones = sequence("output_cones", output_cones)
-    for i, cone in enumerate(cones):
-        instance(f"output_cones[{i}]", cone, SecondOrderCone)
-        check_dimension(f"output_cones[{i}]", cone.dim, system.ny)
-    limits = []
-    if len(Z.h):
-        limits.append(cp.hstack([X, U]) @ Z.H.T <= np.tile(Z.h, (X.shape[0], 1)))
-    Y = X @ system.C.T
-    for cone in cones:
-        limits.append(cp.norm(Y @ cone.F.T + cone.g, 2, axis=1) <= Y @ cone.c + cone.d)
-    return limits
-
-
-def _factor(matrix: np.ndarray) -> np.ndarray:
-    """Return F with F Fᵀ = matrix."""
-    values, vectors = np.linalg.eigh(matrix)
-    return vectors * np.sqrt(np.clip(values, 0, None))
+    def multipliers(self, found: ConeSolution) -> np.ndarray:
+        """Return by how much the optimum falls for each unit by which the parameter grows."""
+        return self._slope.T @ found.y

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from typing import Any
 
 import numpy as np
@@ -41,10 +42,11 @@ class MPCSolution:
         A sentence that says what the status means here.
     iterations : int, or int array (...)
     residual : float, or array (...)
-        How far from optimal: for `LinearMPC` the larger of the primal and dual residual, for
-        `ConvexMPC` the largest of these and the relative duality gap, for `BatchedMPC` a proven
-        bound on the distance of the inputs from the optimal ones, for `NonlinearMPC` the part of
-        ∇σ that no active constraint balances, relative to 1 + ‖∇σ‖∞.
+        How far from optimal: for `LinearMPC` and `ConvexMPC` the largest violation of the
+        optimality conditions relative to the sizes of their terms (of "infeasible": what the
+        proof lacks), for `BatchedMPC` a proven bound on the distance of the inputs from the
+        optimal ones, for `NonlinearMPC` the part of ∇σ that no active constraint balances,
+        relative to 1 + ‖∇σ‖∞.
     seconds : float
         Wall time of the solve.
     """
@@ -117,6 +119,14 @@ def infeasible_message(x0: np.ndarray, horizon: int) -> str:
     )
 
 
+def fixed_message(x0: np.ndarray) -> str:
+    """Say what "infeasible" means where no input has a part in it."""
+    return (
+        f"no input sequence keeps x(0) = {np.array2string(x0, precision=4)} within the "
+        "constraints: it breaks one that no input moves, at once or some steps later"
+    )
+
+
 def check_state(x0: ArrayLike, nx: int) -> Any:
     """Return x0 (..., nx) as a float64 array, or raise a ValueError that names it."""
     return shaped("x0", finite_array("x0", x0), (nx,), "the system's states")
@@ -134,3 +144,51 @@ def predicted(system: LinearSystem, states: np.ndarray, inputs: np.ndarray) -> T
     """Return a plan as a trajectory, NaN where the solve failed."""
     # Built without validation: the values of a failed solve are NaN on purpose.
     return bypass_init(Trajectory, x=states, u=inputs, y=states[:-1] @ system.C.T)
+
+
+def no_plan(
+    system: LinearSystem, horizon: int, status: str, message: str, began: float
+) -> MPCSolution:
+    """Return the answer where there is nothing to solve."""
+    plan = np.full((horizon + 1, system.nx), np.nan), np.full((horizon, system.nu), np.nan)
+    return MPCSolution(
+        u=plan[1][0],
+        trajectory=predicted(system, *plan),
+        cost=np.nan,
+        status=status,
+        message=message,
+        iterations=0,
+        residual=0.0,
+        seconds=time.perf_counter() - began,
+    )
+
+
+def mpc_solution(
+    system: LinearSystem,
+    x0: np.ndarray,
+    plan: tuple[np.ndarray, np.ndarray],
+    cost: float,
+    found: Any,
+    began: float,
+) -> MPCSolution:
+    """Return the answer of a controller: the plan, or NaN and the reason why there is none.
+
+    ``plan`` is the states and inputs; ``found`` has status, message, iterations and residual.
+    """
+    message, (states, inputs) = found.message, plan
+    if found.status == "infeasible":
+        message = infeasible_message(x0, len(inputs))
+    if found.status != "solved":
+        states, inputs = np.full_like(states, np.nan), np.full_like(inputs, np.nan)
+        cost = np.nan
+    inputs = np.clip(inputs, system.u_min, system.u_max)
+    return MPCSolution(
+        u=inputs[0],
+        trajectory=predicted(system, states, inputs),
+        cost=cost,
+        status=found.status,
+        message=message,
+        iterations=found.iterations,
+        residual=found.residual,
+        seconds=time.perf_counter() - began,
+    )

@@ -11,9 +11,18 @@ import scipy.linalg
 from jax.typing import ArrayLike
 
 from prefmpc._checks import finite_array, instance, nonnegative, shaped, single
+from prefmpc._units import cost_units
 from prefmpc.models import QuadraticCost, SumCost
-from prefmpc.mpc._cone import expression, stage_limits
+from prefmpc.mpc._cone import ConeSolution, ParametricProgram
+from prefmpc.mpc._expressions import (
+    check_cones,
+    check_convex,
+    expression,
+    stage_limits,
+    weights,
+)
 from prefmpc.mpc.solution import MPCSolution
+from prefmpc.mpc.terminal import stage_constraints
 from prefmpc.networks import ICNNCost
 from prefmpc.sets import Polyhedron, SecondOrderCone
 from prefmpc.systems import LinearSystem
@@ -102,7 +111,7 @@ def check_stability(
     cost : QuadraticCost, ICNNCost or SumCost of these
     constraints, output_cones : as for `ConvexMPC`
     tol : float
-        Largest `gap`, relative to 1 + abs(ℓ(z_s)), that counts as none.
+        Largest `gap`, relative to ℓ(z_s) and to what one unit of z costs, that counts as none.
 
     Returns
     -------
@@ -114,15 +123,15 @@ def check_stability(
     ValueError
         If σ is not one of the convex models or something does not fit.
     """
-    import cvxpy
-
-    cp: Any = cvxpy
     instance("system", system, LinearSystem)
     single("system", system)
     tol = nonnegative("tol", tol)
     nx, nu = system.nx, system.nu
-    x, u = cp.Variable((1, nx)), cp.Variable((1, nu))
-    limits = stage_limits(cp, system, constraints, output_cones, x, u)
+    over_trajectory = _over_trajectory(cost)
+    if not over_trajectory:
+        check_convex(cost, nx, nu, 1)
+    stage_constraints(system, constraints)
+    check_cones(system, output_cones)
 
     def answer(stable: bool, reason: str, **found: Any) -> StabilityCheck:
         nothing: dict[str, Any] = {
@@ -135,36 +144,75 @@ def check_stability(
         }
         return StabilityCheck(stable, reason, cost, system, **{**nothing, **found})
 
-    if _over_trajectory(cost):
+    if over_trajectory:
         return answer(False, "σ looks at whole trajectories, so it is no sum of stage costs")
-    stage = expression(cp, cost, x, u)
-    still = x - x @ system.A.T - u @ system.B.T
-    steady = cp.Problem(cp.Minimize(stage), [still == 0, *limits])
-    steady.solve(cp.CLARABEL, canon_backend=cp.SCIPY_CANON_BACKEND)
+    dx, du = cost_units(system.A, system.B, *weights(cost, nx, nu))
+    programs = _Programs(system, cost, constraints, output_cones, (dx, du))
+    steady, x, u, multiplier = programs.steady()
     if steady.status == "infeasible":
         return answer(False, "no steady state satisfies the constraints")
-    if steady.status != "optimal":
-        return answer(False, f"the best steady state was not found: {steady.status}")
+    if steady.status != "solved":
+        return answer(False, f"the best steady state was not found: {steady.message}")
     best: dict[str, Any] = {
-        "x": np.array(x.value[0]),
-        "u": np.array(u.value[0]),
-        "multiplier": np.array(steady.constraints[0].dual_value[0]),
-        "stage_cost": float(steady.value),
+        "x": x,
+        "u": u,
+        "multiplier": multiplier / dx,
+        "stage_cost": steady.objective,
         "modulus": _modulus(cost, nx, nu),
     }
-    # A second program looks for a stage whose rotated cost is negative.
-    rotated = cp.Problem(cp.Minimize(stage + cp.sum(still @ best["multiplier"])), limits)
-    rotated.solve(cp.CLARABEL, canon_backend=cp.SCIPY_CANON_BACKEND)
-    lowest = float(rotated.value) if rotated.status == "optimal" else -np.inf
+    rotated = programs.rotated(multiplier)
+    lowest = rotated.objective if rotated.status == "solved" else -np.inf
     gap = best["gap"] = max(0.0, best["stage_cost"] - lowest)
-    curvature = np.linalg.eigvalsh(best["modulus"][:nx, :nx])
+    curvature = np.linalg.eigvalsh(best["modulus"][:nx, :nx] * dx * dx[:, None])
     if not curvature[0] > 1e-12 * max(curvature[-1], 1e-300):
         return answer(
             False, "σ is not strictly convex in the states; a floor would make it", **best
         )
-    if not gap <= tol * (1 + abs(best["stage_cost"])):
-        return answer(False, f"the rotated stage cost falls to {-gap:.1e}", **best)
+    if not gap <= tol * (steady.unit**2 + abs(best["stage_cost"])):
+        why = "" if rotated.status == "solved" else f" ({rotated.message})"
+        return answer(False, f"the rotated stage cost falls to {-gap:.1e}{why}", **best)
     return answer(True, "the rotated stage cost is positive away from the steady state", **best)
+
+
+class _Programs:
+    """The best steady state, and the stage with the lowest rotated cost, in ``units``."""
+
+    def __init__(
+        self,
+        system: LinearSystem,
+        cost: Any,
+        constraints: Polyhedron | None,
+        output_cones: Sequence[SecondOrderCone],
+        units: tuple[np.ndarray, np.ndarray],
+    ) -> None:
+        import cvxpy
+
+        cp: Any = cvxpy
+        self._cp = cp
+        dx, du = self._units = units
+        x, u = self._signals = cp.Variable((1, system.nx)), cp.Variable((1, system.nu))
+        self._moved = cp.Parameter(system.nx)
+        A, B = system.A * dx / dx[:, None], system.B * du / dx[:, None]
+        self._still = x - x @ A.T - u @ B.T
+        scaled = cp.multiply(x, dx[None]), cp.multiply(u, du[None])
+        self._stage = expression(cp, cost, *scaled)
+        self._limits = stage_limits(cp, system, constraints, output_cones, self._signals, units)
+
+    def steady(self) -> tuple[ConeSolution, np.ndarray, np.ndarray, np.ndarray]:
+        """Return the solution, x, u, and the multiplier of x = A x + B u in own units."""
+        program = self._program(self._stage, [self._still[0] == self._moved, *self._limits])
+        found, (x, u) = program.solve(np.zeros(self._moved.size))
+        dx, du = self._units
+        return found, x[0] * dx, u[0] * du, program.multipliers(found)
+
+    def rotated(self, multiplier: np.ndarray) -> ConeSolution:
+        """Look for a stage whose rotated cost is negative."""
+        total = self._stage + self._cp.sum(self._still[0] @ multiplier)
+        return self._program(total, self._limits).solve(np.zeros(self._moved.size))[0]
+
+    def _program(self, total: Any, limits: list[Any]) -> ParametricProgram:
+        problem = self._cp.Problem(self._cp.Minimize(total), limits)
+        return ParametricProgram(problem, self._moved, self._signals)
 
 
 def _over_trajectory(cost: Any) -> bool:

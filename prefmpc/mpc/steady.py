@@ -6,22 +6,22 @@ import dataclasses
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 from jax.typing import ArrayLike
 
 from prefmpc._checks import finite_array, flag, instance, sequence, shaped, single
 from prefmpc._pytree import bypass_init
-from prefmpc.mpc._cone import TIGHT, ConeProgram
+from prefmpc.mpc._target import Target, input_sizes
 from prefmpc.mpc.solution import MPCSolution, check_dimension
 from prefmpc.mpc.terminal import stage_constraints
-from prefmpc.nonlinear import NonlinearSystem
 from prefmpc.sets import Polyhedron
 from prefmpc.systems import LinearSystem, System
 from prefmpc.trajectories import Trajectory
 
 REACHED = 1e-6
 STEPS = 50
-SMALL = 1e-9
+EXACT = 1e-9
+SMALL = 1e-7
+"""Of the linear plants near a nonlinear one singular values below this share are zero."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -41,9 +41,11 @@ def steady_state(
     start: tuple[ArrayLike, ArrayLike] | None = None,
     nearest: bool = False,
 ) -> SteadyState:
-    """Return the steady state with the output y_r and, if there are several, the least ‖(x, u)‖.
+    """Return the steady state with the output y_r and, if there are several, the smallest.
 
-    A quadratic program for a linear plant, a sequence of them for a nonlinear one.
+    The norm of (x, u) is in units of half the range of each input, and of what that moves; inputs
+    without limits have the unit with which they move y as much. By linear algebra for a linear
+    plant, and a quadratic program where limits are met; a sequence of these for a nonlinear one.
 
     Parameters
     ----------
@@ -51,7 +53,9 @@ def steady_state(
     constraints : Polyhedron, optional
         Over the stacked (x, u); the steady state must satisfy them, and the input bounds.
     start : (x, u), optional
-        For a nonlinear plant: where to start from. Default: the origin.
+        For a nonlinear plant: where to start from. For a linear one: the value of what no input
+        moves and what stays by itself, such as a constant disturbance among the states; it is
+        taken from this x. Default: the origin, hence no disturbance.
     nearest : bool
         Return the steady state whose output is nearest to y_r, if it cannot be reached.
 
@@ -73,16 +77,17 @@ def steady_state(
         x = np.asarray(shaped("start[0]", finite_array("start[0]", given[0], ndim=1), (system.nx,)))
         u = np.asarray(shaped("start[1]", finite_array("start[1]", given[1], ndim=1), (system.nu,)))
     Z = stage_constraints(system, constraints)
-    found = _search(system, wanted, Z, x, u)
+    search = _held if isinstance(system, LinearSystem) else _search
+    found = search(system, wanted, Z, x, u)
     if found is None:
-        raise ValueError(f"y_r must have a steady state, but none was found near y_r = {wanted}")
-    miss = np.abs(found.y - wanted).max()
-    if nearest or miss <= REACHED * (1 + np.abs(wanted).max()):
+        within = " within the constraints" if len(Z.h) else ""
+        raise ValueError(
+            f"y_r must have a steady state, but none was found{within} near y_r = {wanted}"
+        )
+    if nearest or _reached(system, found, wanted):
         return found
-    free = _search(system, wanted, Polyhedron(np.zeros((0, Z.dim)), np.zeros(0)), x, u)
-    held = free is not None and np.abs(free.y - wanted).max() <= REACHED * (
-        1 + np.abs(wanted).max()
-    )
+    free = search(system, wanted, None, x, u)
+    held = free is not None and _reached(system, free, wanted)
     why = (
         f"lies outside of the constraints: holding it takes x = {free.x}, u = {free.u}"
         if held and free is not None
@@ -102,12 +107,21 @@ def check_reference(
     check_dimension("reference", reference.u.size, system.nu)
     if ingredients:
         raise ValueError("reference must be None with TerminalIngredients, made for the origin")
-    z = np.concatenate([reference.x, reference.u])
-    if not stage_constraints(system, constraints).contains(z, tol=REACHED):
+    z, Z = np.concatenate([reference.x, reference.u]), stage_constraints(system, constraints)
+    room = REACHED * np.maximum(np.abs(Z.h), np.abs(Z.H) @ np.abs(z))
+    if not (Z.H @ z <= Z.h + room).all():
         raise ValueError(f"reference must satisfy the constraints, got x, u = {z}")
-    drift = np.abs(np.asarray(system.step(reference.x, reference.u)) - reference.x).max()
-    if not drift <= REACHED * (1 + np.abs(z).max()):
-        raise ValueError(f"reference must be a steady state, but its next state moves by {drift}")
+    drift = np.abs(np.asarray(system.step(reference.x, reference.u)) - reference.x)
+    size: Any = 1 + np.abs(z).max()
+    if isinstance(system, LinearSystem):
+        rows = np.concatenate([system.A, system.B], axis=1)
+        size = np.abs(reference.x) + np.abs(rows) @ np.abs(z)
+        if not (drift <= REACHED * size).all():  # where only rounding is left of all terms
+            size = _typical(system, reference)[: system.nx]
+    if not (drift <= REACHED * size).all():
+        raise ValueError(
+            f"reference must be a steady state, but its next state moves by {drift.max()}"
+        )
 
 
 def with_reference(solution: MPCSolution, reference: SteadyState | None) -> MPCSolution:
@@ -121,55 +135,64 @@ def with_reference(solution: MPCSolution, reference: SteadyState | None) -> MPCS
     )
 
 
-def _search(
-    system: System, wanted: np.ndarray, Z: Polyhedron, x: np.ndarray, u: np.ndarray
-) -> SteadyState | None:
-    """Solve quadratic programs, each with the plant linear near the last answer."""
-    for _ in range(STEPS):
-        near = _linear(system, x, u)
-        y, x_next = np.asarray(system.output(x)), np.asarray(system.step(x, u))
-        if near is None or not np.isfinite(x_next).all():
-            return None
-        A, B, C = near
-        move = _program(system, (A, B, C), wanted - y, x - x_next, Z, np.concatenate([x, u]))
-        if move is None:
-            return None
-        x, u = x + move[: x.size], u + move[x.size :]
-        gap = np.abs(np.asarray(system.step(x, u)) - x).max()
-        size = 1 + np.abs(np.concatenate([x, u])).max()
-        if gap <= SMALL * size and (
-            isinstance(system, LinearSystem) or np.abs(move).max() <= REACHED * size
-        ):
-            return SteadyState(x, u, np.asarray(system.output(x)))
-    return None
+def _typical(system: LinearSystem, held: SteadyState) -> np.ndarray:
+    """Return sizes (nx + nu,) of x and u next to which a share of `REACHED` is nothing."""
+    z = np.abs(np.concatenate([held.x, held.u]))
+    units = input_sizes(system.A, system.B, system.C, system.u_min, system.u_max)
+    return np.maximum(z, units * (z / units).max())
 
 
-def _linear(system: System, x: np.ndarray, u: np.ndarray) -> Any:
+def _reached(system: System, found: SteadyState, wanted: np.ndarray) -> bool:
+    """Say whether the output is the wanted one, each to a share of the size that it can have."""
     if isinstance(system, LinearSystem):
-        return system.A, system.B, system.C
-    assert isinstance(system, NonlinearSystem)
-    try:
-        near = system.linearise(x, np.clip(u, system.u_min, system.u_max))
-    except ValueError:
-        return None
-    return near.A, near.B, near.C
+        typical = _typical(system, found)[: system.nx]
+        size = np.maximum(np.abs(wanted), np.abs(system.C) @ typical)
+    else:
+        size = 1 + np.abs(wanted).max() + np.zeros(wanted.size)
+    return bool((np.abs(found.y - wanted) <= REACHED * size).all())
 
 
-def _program(
-    system: System, near: Any, miss: np.ndarray, drift: np.ndarray, Z: Polyhedron, z: np.ndarray
-) -> np.ndarray | None:
-    """Return the move (dx, du): least ‖C dx − miss‖² with A dx + B du − dx = drift, z + d ∈ Z."""
-    import clarabel
+def _held(
+    system: Any, wanted: np.ndarray, Z: Polyhedron | None, x: np.ndarray, u: np.ndarray
+) -> SteadyState | None:
+    """Return what a linear plant can hold, with what no input moves as in x."""
+    A, B, C = system.A, system.B, system.C
+    sizes = input_sizes(A, B, C, system.u_min, system.u_max)
+    z = Target(A, B, C, np.zeros(len(A)), wanted, sizes, keep=x).solve(Z)
+    return None if z is None else _point(system, z, Z)
 
-    A, B, C = near
-    nx, n = system.nx, system.nx + system.nu
-    E = np.concatenate([C, np.zeros((len(C), system.nu))], axis=1)
-    # The second term decides among several; it is too small to move y.
-    P = 2 * (E.T @ E + SMALL * np.eye(n))
-    q = 2 * (SMALL * z - E.T @ miss)
-    rest = np.concatenate([A - np.eye(nx), B], axis=1)
-    cones = [clarabel.ZeroConeT(nx), clarabel.NonnegativeConeT(len(Z.h))]
-    b = np.concatenate([drift, Z.h - Z.H @ z])
-    rows = sp.csc_matrix(np.concatenate([rest, Z.H]))
-    found = ConeProgram(sp.csc_matrix(P), q, rows, b, cones, TIGHT).solve(b)
-    return found.z if found.status == "solved" else None
+
+def _point(system: System, z: np.ndarray, Z: Polyhedron | None) -> SteadyState:
+    x, u = z[: system.nx], z[system.nx :]
+    # Rounding must not lead out of the bounds.
+    u = u if Z is None else np.clip(u, system.u_min, system.u_max)
+    return SteadyState(x, u, np.asarray(system.output(x)))
+
+
+def _search(
+    system: Any, wanted: np.ndarray, Z: Polyhedron | None, x: np.ndarray, u: np.ndarray
+) -> SteadyState | None:
+    """Find what a nonlinear plant can hold, by taking it as linear near the last answer."""
+    sizes = None
+    for _ in range(STEPS):
+        try:
+            near = system.linearise(x, np.clip(u, system.u_min, system.u_max))
+        except ValueError:
+            return None
+        A, B, C = near.A, near.B, near.C
+        y, x_next = np.asarray(system.output(x)), np.asarray(system.step(x, u))
+        if not np.isfinite(x_next).all():
+            return None
+        if sizes is None:
+            sizes = input_sizes(A, B, C, system.u_min, system.u_max)
+        right = A @ x + B @ u - x_next
+        z = Target(A, B, C, right, wanted - y + C @ x, sizes, rank=SMALL).solve(Z)
+        if z is None:
+            return None
+        move = np.abs(z - np.concatenate([x, u])) / sizes
+        x, u = z[: x.size], z[x.size :]
+        gap = np.abs(np.asarray(system.step(x, u)) - x) / sizes[: x.size]
+        size = 1 + np.abs(z / sizes).max()
+        if gap.max() <= EXACT * size and move.max() <= REACHED * size:
+            return _point(system, z, Z)
+    return None

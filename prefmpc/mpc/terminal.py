@@ -9,10 +9,15 @@ import numpy as np
 from scipy.optimize import linprog
 
 from prefmpc._checks import instance, nonnegative, positive_int, single
+from prefmpc._pytree import bypass_init
 from prefmpc.models import QuadraticCost
 from prefmpc.mpc.solution import check_dimension, check_problem
 from prefmpc.sets import Ellipsoid, Polyhedron
 from prefmpc.systems import LinearSystem, System
+
+ROUNDING = 1e-14
+WIDE = 1e6
+"""States so many times beyond where the closest limit is are of no interest."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -123,51 +128,74 @@ def terminal_ingredients(
         )
     K, P = system.lqr(cost.Q, cost.R)
     closed = system.A - system.B @ K
-    rows = Z.H[:, : system.nx] - Z.H[:, system.nx :] @ K  # what u = −K x leaves of Z
-    # A row that the feedback never meets bounds nothing.
-    rows, heights = rows[kept := np.abs(rows).max(axis=1) > 0], Z.h[kept]
-    reach = np.einsum("ri,ri->r", rows, np.linalg.solve(P, rows.T).T)
-    level = float((heights**2 / reach).min()) if len(rows) else np.inf
-    polyhedron = _maximal_invariant(closed, rows, heights, max_steps, tol)
-    return TerminalIngredients(P, K, polyhedron, Ellipsoid(P, level))
+    Hx, Hu = Z.H[:, : system.nx], Z.H[:, system.nx :]
+    rows = Hx - Hu @ K  # what u = −K x leaves of Z
+    # A row that the feedback meets by rounding alone bounds nothing.
+    kept = (np.abs(rows) > ROUNDING * (np.abs(Hx) + np.abs(Hu) @ np.abs(K))).any(axis=1)
+    kept &= np.isfinite(Z.h)
+    rows, heights = rows[kept], Z.h[kept]
+    # In units in which P has ones on its diagonal and every limit is 1.
+    dx = 1 / np.sqrt(np.where(np.diag(P) > 0, np.diag(P), 1.0))
+    # There, eigenvalues tell whether P is positive definite; in the user's units they need not.
+    unit_P = Ellipsoid(P * dx * dx[:, None]).P
+    unit_rows = rows * dx / heights[:, None]
+    reach = np.einsum("ri,ri->r", unit_rows, np.linalg.solve(unit_P, unit_rows.T).T)
+    level = 1 / float(reach.max()) if len(rows) else np.inf
+    H, of = _maximal_invariant(closed * dx / dx[:, None], unit_rows, max_steps, tol)
+    polyhedron = Polyhedron(H / dx * heights[of][:, None], heights[of])
+    ellipsoid = bypass_init(Ellipsoid, P=unit_P / dx / dx[:, None], level=level)
+    return TerminalIngredients(P, K, polyhedron, ellipsoid)
 
 
 def _maximal_invariant(
-    closed: np.ndarray, rows: np.ndarray, heights: np.ndarray, max_steps: int, tol: float
-) -> Polyhedron:
-    """Return the largest set with rows @ x ≤ heights for x and all that follows from x⁺ = closed x.
+    closed: np.ndarray, rows: np.ndarray, max_steps: int, tol: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return H of the largest set H x ≤ 1 with rows @ x ≤ 1 for x and all x⁺ = closed x after it.
 
-    The algorithm of Gilbert and Tan: add the rows of one more step until they are redundant.
+    Also the row from which each row of H comes. The algorithm of Gilbert and Tan: add the rows of
+    one more step until they are redundant.
     """
+    H, of, power = rows, np.arange(len(rows)), np.eye(len(closed))
     if not len(rows):
-        return Polyhedron(np.zeros((0, len(closed))), np.zeros(0))
-    H, h, power = rows, heights, np.eye(len(closed))
+        return H, of
     for _ in range(max_steps):
         power = power @ closed
-        new = [
-            (row, height)
-            for row, height in zip(rows @ power, heights, strict=True)
-            if _largest(row, H, h) > height * (1 + tol)
-        ]
-        if not new:
-            return _without_redundant_rows(H, h, tol)
-        H = np.concatenate([H, [row for row, _ in new]])
-        h = np.concatenate([h, [height for _, height in new]])
+        later = rows @ power
+        new = np.array([_largest(row, H) > 1 + tol for row in later])
+        if not new.any():
+            keep = _needed(H, tol)
+            return H[keep], of[keep]
+        H, of = np.concatenate([H, later[new]]), np.concatenate([of, np.flatnonzero(new)])
     raise ValueError(
         f"max_steps must suffice to find the terminal polyhedron, it still grew after {max_steps}"
     )
 
 
-def _largest(row: np.ndarray, H: np.ndarray, h: np.ndarray) -> float:
-    """Return max row @ x over H x ≤ h; infinite if there is none."""
-    answer = linprog(-row, A_ub=H, b_ub=h, bounds=(None, None), method="highs")
-    return -float(answer.fun) if answer.status == 0 else np.inf
+def _largest(row: np.ndarray, H: np.ndarray) -> float:
+    """Return max row @ x over H x ≤ 1 and ‖x‖∞ ≤ `WIDE`, infinite if it is not found.
+
+    A row is left out only if it is shown to be redundant: one too many does no harm.
+    """
+    unit = np.abs(H).max(axis=0)
+    unit = np.where(unit > 0, unit, np.abs(row))
+    unit = np.where(unit > 0, unit, 1.0)
+    size = np.abs(row / unit).max()
+    answer = linprog(
+        -row / unit / size,
+        A_ub=H / unit,
+        b_ub=np.ones(len(H)),
+        bounds=(-WIDE, WIDE),
+        method="highs",
+    )
+    found = answer.status == 0 and np.isfinite(answer.fun)
+    return -float(answer.fun) * float(size) if found else np.inf
 
 
-def _without_redundant_rows(H: np.ndarray, h: np.ndarray, tol: float) -> Polyhedron:
-    keep = np.ones(len(h), dtype=bool)
-    for i in range(len(h)):
+def _needed(H: np.ndarray, tol: float) -> np.ndarray:
+    """Say which rows of H x ≤ 1 are not redundant."""
+    keep = np.ones(len(H), dtype=bool)
+    for i in range(len(H)):
         keep[i] = False
-        if _largest(H[i], H[keep], h[keep]) > h[i] * (1 + tol):
+        if _largest(H[i], H[keep]) > 1 + tol:
             keep[i] = True
-    return Polyhedron(H[keep], h[keep])
+    return keep
