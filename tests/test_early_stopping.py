@@ -193,7 +193,7 @@ def test_an_epoch_takes_each_pair_once_whatever_the_sizes(n, size):
 
 
 def test_a_part_of_a_batch_that_is_free_counts_for_nothing():
-    data = pair_data(STARTS, NOISY, 1024)
+    data = jax.device_put(pair_data(STARTS, NOISY, 1024))
     part = _part(data, np.array([3, 7, 1024, 1024]))
     alone = _part(data, np.array([3, 7]))
     assert float(cross_entropy(STARTS[0], part)) == pytest.approx(
