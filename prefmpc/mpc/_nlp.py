@@ -298,7 +298,11 @@ def _slsqp(
     constraints = []
     if program.rows:
         constraints = [
-            {"type": "ineq", "fun": lambda z: -values(z)[1], "jac": lambda z: -program.slopes(z).jacobian}
+            {
+                "type": "ineq",
+                "fun": lambda z: -values(z)[1],
+                "jac": lambda z: -program.slopes(z).jacobian,
+            }
         ]
     found = minimize(
         lambda z: values(z)[0] / size,

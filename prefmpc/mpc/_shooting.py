@@ -189,22 +189,29 @@ class Slopes(NamedTuple):
     near: Any
     """(m,): each in its own stage."""
 
+    @classmethod
+    def of(cls, table: Any, sizes: Any) -> Slopes:
+        """Take apart what `slopes` returns."""
+        table = np.asarray(table)
+        return cls(table[0], table[2:], table[1], *np.asarray(sizes))
+
 
 @jax.jit(static_argnums=0)
-def slopes(known: Known, flat: Any, z: Any) -> Slopes:
-    """Return ∇σ and ∂c/∂z, and the sizes of σ's slopes and of the constraints."""
+def slopes(known: Known, flat: Any, z: Any) -> tuple[Any, Any]:
+    """Return what `Slopes` are made of: each array more that is returned takes time."""
     problem, given, path, X, U = _unpacked(known, flat, z)
     (A, B), Sx, Su = _sensitivities(problem, X, U)
     largest_u = input_size(jnp.asarray(problem.system.u_min), problem.system.u_max)
     reach_u = jnp.maximum(jnp.abs(U), largest_u)
 
-    def along(gx: Any, gu: Any, Sx: Any, Su: Any) -> Any:
-        return jnp.einsum("kx,kxn->n", gx, Sx) + jnp.einsum("ku,kun->n", gu, Su)
+    def joined(x: Any, u: Any) -> Any:
+        return jnp.concatenate([x.ravel(), u.ravel()])
 
+    S = jnp.concatenate([Sx.reshape(-1, z.size), Su.reshape(-1, z.size)])
     descent = jax.grad(lambda x, u: _cost(problem, given, x, u), argnums=(0, 1))
-    (gx, gu), bent = jax.jvp(descent, (X, U), (jnp.abs(X), reach_u))
-    bends = [jnp.where(jnp.isfinite(part), ROUNDING * jnp.abs(part), 0.0) for part in bent]
-    size = along(jnp.abs(gx) + bends[0], jnp.abs(gu) + bends[1], jnp.abs(Sx), jnp.abs(Su))
+    pull, bent = (joined(*part) for part in jax.jvp(descent, (X, U), (jnp.abs(X), reach_u)))
+    rounding = jnp.where(jnp.isfinite(bent), ROUNDING * jnp.abs(bent), 0.0)
+    size = (jnp.abs(pull) + rounding) @ jnp.abs(S)
 
     on_stage = jax.vmap(lambda x, u: _on_stage(problem, path, x, u))
     cx, cu = jax.vmap(jax.jacfwd(lambda x, u: _on_stage(problem, path, x, u), argnums=(0, 1)))(
@@ -221,12 +228,10 @@ def slopes(known: Known, flat: Any, z: Any) -> Slopes:
     ex = jax.jacfwd(lambda x: _at_end(problem, x))(X[-1])
     limit = jnp.abs(ex @ X[-1] - _at_end(problem, X[-1]))
     ends = jnp.maximum(limit, jnp.abs(ex) @ jnp.abs(X).max(0))
-    return Slopes(
-        along(gx, gu, Sx, Su),
-        jnp.concatenate([stages, ex @ Sx[-1]]),
-        size,
-        jnp.concatenate([jnp.tile(near.max(0), len(U)), ends]),
-        jnp.concatenate([near.ravel(), ends]),
+    table = jnp.concatenate([(pull @ S)[None], size[None], stages, ex @ Sx[-1]])
+    largest = jnp.tile(near.max(0), len(U))
+    return table, jnp.stack(
+        [jnp.concatenate([largest, ends]), jnp.concatenate([near.ravel(), ends])]
     )
 
 

@@ -46,9 +46,7 @@ class Units:
         return plan[self.free] / self.z
 
 
-def own_units(
-    program: Program, guess: np.ndarray, inputs: int
-) -> tuple[Program, Units]:
+def own_units(program: Program, guess: np.ndarray, inputs: int) -> tuple[Program, Units]:
     """Return the program in units of its own, taken from where it starts.
 
     An input without two limits is measured by how far it is from its optimum, as a diagonal

@@ -277,7 +277,7 @@ class NonlinearMPC(Controller):
             return guesses
         f, c = (np.array(part) for part in zip(*map(program.values, guesses), strict=True))
         broken = np.zeros(len(f))
-        if program.rows:
+        if (c > 0).any():
             size = program.slopes(guesses[0]).near
             broken = (np.maximum(c, 0) / np.where(size > 0, size, 1.0)).sum(axis=1)
         largest = np.abs(f[np.isfinite(f)]).max(initial=0.0)
@@ -296,7 +296,7 @@ class NonlinearMPC(Controller):
 
         @_nlp.remembered
         def slopes(z: np.ndarray) -> shooting.Slopes:
-            return shooting.Slopes(*map(np.asarray, shooting.slopes(layout, flat, z)))
+            return shooting.Slopes.of(*shooting.slopes(layout, flat, z))
 
         @_nlp.remembered
         def curvature(z: np.ndarray, multipliers: np.ndarray, factor: Any) -> np.ndarray:
