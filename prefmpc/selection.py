@@ -17,7 +17,6 @@ from prefmpc.convex import MapResult, check, fit_map
 from prefmpc.losses import FitError, padded_size
 from prefmpc.priors import Structure, WishartPrior
 
-
 MODE_FOUND = 1e-6
 """So near to its mode, in nats relative to the evidence, is what Laplace's method looks at."""
 

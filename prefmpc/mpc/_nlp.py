@@ -27,6 +27,9 @@ NEWTON_STEPS = 60
 SHORTEST = 1e-3
 """Newton steps that have to be shorter than this fraction lead nowhere."""
 
+BALANCED = 1e-11
+"""A point whose slopes are balanced so well, relative to their terms, needs no further step."""
+
 REMEMBERED = 4
 
 
@@ -96,6 +99,8 @@ def attempt(
 ) -> Attempt:
     """Run a solver from ``start``, and judge where it stops without trusting what it says."""
     z = np.clip(start, program.lower, program.upper)
+    if not z.size:  # every input is locked
+        return _judge(program, z, False, 0)
     if solver == "ipopt":
         return _judge(program, *_ipopt(program, z, max_iterations))
     best = _judge(program, *_newton(program, z, min(max_iterations, NEWTON_STEPS)))
@@ -173,7 +178,7 @@ def stationarity(program: Program, z: np.ndarray) -> float:
         ]
     )
     rest = slope
-    if len(pushing):
+    if pushing.size:
         length = np.maximum(np.linalg.norm(pushing, axis=1), 1e-12)
         directions = (pushing / length[:, None]).T
         try:
@@ -181,8 +186,8 @@ def stationarity(program: Program, z: np.ndarray) -> float:
         except RuntimeError:
             return np.inf
         rest = slope + directions @ multipliers
-    worst, largest = float(np.abs(rest).max(initial=0.0)), float(size.max(initial=0.0))
-    return worst / largest if largest > 0 else worst
+    # Each input for itself: in an unstable plant the first ones matter far more than the last.
+    return float((np.abs(rest) / np.where(size > 0, size, 1.0)).max(initial=0.0))
 
 
 def _newton(program: Program, z: np.ndarray, steps: int) -> tuple[np.ndarray, bool, int]:
@@ -198,12 +203,16 @@ def _newton(program: Program, z: np.ndarray, steps: int) -> tuple[np.ndarray, bo
     every = np.zeros(program.rows + int(up.sum()) + int(down.sum()))
     weight = 0.0
     for count in range(1, steps + 1):
-        slope, jacobian, *_ = program.slopes(z)
+        slope, jacobian, size, *_ = program.slopes(z)
+        A = np.concatenate([jacobian, eye[up], -eye[down]])
+        b = np.concatenate([-c, (program.upper - z)[up], (z - program.lower)[down]])
+        size = np.maximum(size, 1e-300)
+        missing = (slope + every @ A) / size, every * b / size.max(), np.minimum(b, 0)
+        if all((np.abs(m) <= BALANCED).all() for m in missing):
+            return z, False, count - 1
         H = program.curvature(z, every[: program.rows], 1.0)
         if not (np.isfinite(slope).all() and np.isfinite(jacobian).all() and np.isfinite(H).all()):
             return z, False, count
-        A = np.concatenate([jacobian, eye[up], -eye[down]])
-        b = np.concatenate([-c, (program.upper - z)[up], (z - program.lower)[down]])
         H, exact = _convex((H + H.T) / 2, A[every > 0])
         found = quadratic_program(H, slope, A, b)
         if found is None:
@@ -237,6 +246,10 @@ def _convex(H: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, bool]:
     values, vectors = np.linalg.eigh(H)
     largest = float(np.abs(values).max()) or 1.0
     floor = 1e-8 * largest
+    if 0 < values[0] <= floor:  # a matter of units only?
+        unit = 1 / np.sqrt(np.diag(H))
+        if np.linalg.eigvalsh(H * unit * unit[:, None])[0] > 1e-8:
+            return H, True
     if values[0] <= floor and len(active):
         # Curvature across active constraints changes no step that stays on them.
         normals = active / np.maximum(np.linalg.norm(active, axis=1), 1e-12)[:, None]
@@ -294,7 +307,8 @@ def _slsqp(
             return f, c
         return HUGE, np.zeros_like(c)  # a trial step that leaves the numbers is only too long
 
-    size = 1 + abs(values(start)[0])
+    size = float(program.slopes(start).size.max()) or 1.0
+    size = size if np.isfinite(size) else 1.0
     constraints = []
     if program.rows:
         constraints = [

@@ -174,8 +174,8 @@ def _sensitivities(problem: Problem, X: Any, U: Any) -> tuple[Any, Any, Any]:
 class Slopes(NamedTuple):
     """Derivatives with respect to z, and the sizes of what they are sums and differences of.
 
-    The size of a slope of σ is the sum of the absolute values of its terms, that of a constraint is
-    as in `_limits.row_sizes`.
+    The size of a slope of σ is the sum of its terms' absolute values, that of a constraint is as in
+    `_limits.row_sizes`.
     """
 
     gradient: Any
@@ -209,9 +209,14 @@ def slopes(known: Known, flat: Any, z: Any) -> tuple[Any, Any]:
 
     S = jnp.concatenate([Sx.reshape(-1, z.size), Su.reshape(-1, z.size)])
     descent = jax.grad(lambda x, u: _cost(problem, given, x, u), argnums=(0, 1))
-    pull, bent = (joined(*part) for part in jax.jvp(descent, (X, U), (jnp.abs(X), reach_u)))
+    (gx, gu), bent = jax.jvp(descent, (X, U), (jnp.abs(X), reach_u))
+    pull, bent = joined(gx, gu), joined(*bent)
     rounding = jnp.where(jnp.isfinite(bent), ROUNDING * jnp.abs(bent), 0.0)
-    size = (jnp.abs(pull) + rounding) @ jnp.abs(S)
+    parts = rounding[: X.size].reshape(X.shape), rounding[X.size :].reshape(U.shape)
+    # Late in a plan all pulls end: there an input counts beside the largest one.
+    parts = parts[0].max(0), parts[1].max(0) + jnp.abs(gu).max(0)
+    least = joined(*(jnp.broadcast_to(p, a.shape) for p, a in zip(parts, (X, U), strict=True)))
+    size = jnp.maximum(jnp.abs(pull), least) @ jnp.abs(S)
 
     on_stage = jax.vmap(lambda x, u: _on_stage(problem, path, x, u))
     cx, cu = jax.vmap(jax.jacfwd(lambda x, u: _on_stage(problem, path, x, u), argnums=(0, 1)))(
@@ -229,10 +234,9 @@ def slopes(known: Known, flat: Any, z: Any) -> tuple[Any, Any]:
     limit = jnp.abs(ex @ X[-1] - _at_end(problem, X[-1]))
     ends = jnp.maximum(limit, jnp.abs(ex) @ jnp.abs(X).max(0))
     table = jnp.concatenate([(pull @ S)[None], size[None], stages, ex @ Sx[-1]])
-    largest = jnp.tile(near.max(0), len(U))
-    return table, jnp.stack(
-        [jnp.concatenate([largest, ends]), jnp.concatenate([near.ravel(), ends])]
-    )
+    along = jnp.tile(near.max(0), len(U))
+    rows = [jnp.concatenate([along, ends]), jnp.concatenate([near.ravel(), ends])]
+    return table, jnp.stack(rows)
 
 
 @jax.jit(static_argnums=0)

@@ -206,6 +206,10 @@ class NonlinearMPC(Controller):
 
             if run(units.part(guess)):
                 break
+            if tries[-1].feasible and not tries[-1].limited:  # in units of where it stopped
+                own, units = own_units(program, tries[-1].z, self.system.nu)
+                if run(units.part(tries[-1].z), own, units):
+                    break
             if not tries[-1].feasible:
                 nearer, violation = _nlp.least_violation(own, units.part(tries[-1].z))
                 if not violation <= _nlp.FEASIBLE:
