@@ -7,10 +7,10 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_triangular
 from scipy.optimize import minimize, nnls
 
 from prefmpc.mpc._limits import ON_LIMIT
+from prefmpc.mpc._quadratic import convex, quadratic_program
 from prefmpc.mpc._shooting import Slopes
 
 ACTIVE = 1e-6
@@ -119,6 +119,20 @@ def attempt(
     return dataclasses.replace(best, iterations=count, limited=again.limited)
 
 
+def promising(program: Program, guesses: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the points to start from, the most promising first: small f, few limits broken."""
+    if len(guesses) == 1:
+        return guesses
+    f, c = (np.array(part) for part in zip(*map(program.values, guesses), strict=True))
+    broken = np.zeros(len(f))
+    if (c > 0).any():
+        size = program.slopes(guesses[0]).near
+        broken = (np.maximum(c, 0) / np.where(size > 0, size, 1.0)).sum(axis=1)
+    merit = f + 1e3 * np.abs(f[np.isfinite(f)]).max(initial=0.0) * broken
+    order = np.lexsort((broken, np.where(np.isfinite(merit), merit, np.inf)))
+    return [guesses[i] for i in order]
+
+
 def least_violation(program: Program, start: np.ndarray) -> tuple[np.ndarray, float]:
     """Return the point near ``start`` with the smallest Σ max(c, 0)², and its largest violation."""
 
@@ -213,7 +227,7 @@ def _newton(program: Program, z: np.ndarray, steps: int) -> tuple[np.ndarray, bo
         H = program.curvature(z, every[: program.rows], 1.0)
         if not (np.isfinite(slope).all() and np.isfinite(jacobian).all() and np.isfinite(H).all()):
             return z, False, count
-        H, exact = _convex((H + H.T) / 2, A[every > 0])
+        H, exact = convex((H + H.T) / 2, A[every > 0])
         found = quadratic_program(H, slope, A, b)
         if found is None:
             return z, False, count
@@ -234,68 +248,13 @@ def _newton(program: Program, z: np.ndarray, steps: int) -> tuple[np.ndarray, bo
             if length < SHORTEST:
                 return z, False, count
         z = trial
-        # The next step is the square of this one; what counts is its size beside the plan's.
+        # The next step is the square of this one; what counts is its size beside the plan's. A tiny
+        # step that the line search shortens is rounding.
         near = np.sqrt(min(1.0, float(np.abs(z).max())))
-        if length == 1 and np.abs(d).max() <= max(near * (1e-6 if exact else 1e-9), 1e-300):
+        small = (1e-6 if exact else 1e-9) if length == 1 else 1e-8
+        if np.abs(d).max() <= max(small * near, 1e-300):
             return z, False, count
     return z, True, steps
-
-
-def _convex(H: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return H, or the like with positive curvature, and whether steps along ``active`` keep it."""
-    values, vectors = np.linalg.eigh(H)
-    largest = float(np.abs(values).max()) or 1.0
-    floor = 1e-8 * largest
-    if 0 < values[0] <= floor:  # a matter of units only?
-        unit = 1 / np.sqrt(np.diag(H))
-        if np.linalg.eigvalsh(H * unit * unit[:, None])[0] > 1e-8:
-            return H, True
-    if values[0] <= floor and len(active):
-        # Curvature across active constraints changes no step that stays on them.
-        normals = active / np.maximum(np.linalg.norm(active, axis=1), 1e-12)[:, None]
-        H = H + 10 * largest * normals.T @ normals
-        values, vectors = np.linalg.eigh(H)
-    if values[0] > floor:
-        return H, True
-    return (vectors * np.maximum(np.abs(values), floor)) @ vectors.T, False
-
-
-def quadratic_program(
-    H: np.ndarray, q: np.ndarray, A: np.ndarray, b: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return d with the least qᵀd + dᵀHd/2 under A d ≤ b, and multipliers; None if there is none.
-
-    With H = LLᵀ this is the search for the point y = Lᵀd + L⁻¹q of a polyhedron nearest to the
-    origin, whose multipliers are a nonnegative least-squares problem (Lawson and Hanson, Solving
-    Least Squares Problems, chapter 23).
-    """
-    try:
-        L = np.linalg.cholesky(H)
-    except np.linalg.LinAlgError:
-        return None
-    free = solve_triangular(L, q, lower=True)
-    G = solve_triangular(L, A.T, lower=True).T
-    size = np.linalg.norm(G, axis=1)
-    moves = np.linalg.norm(A, axis=1) > 1e-12  # the others hold or not, whatever d is
-    if (b[~moves] < -ACTIVE).any():
-        return None
-    G, h = G[moves] / size[moves, None], b[moves] / size[moves]
-    h = h + G @ free
-    y, multipliers = np.zeros(len(q)), np.zeros(len(b))
-    if (h < 0).any():  # else y = 0 will do
-        unit = -float(h.min())
-        target = np.eye(len(q) + 1)[-1]
-        rows = np.concatenate([-G.T, -h[None] / unit])
-        try:
-            v, rest = nnls(rows, target, maxiter=30 * len(h))
-        except RuntimeError:
-            return None
-        miss = target - rows @ v
-        if rest < 1e-10 or miss[-1] <= 1e-14:
-            return None
-        y = -miss[:-1] / miss[-1] * unit
-        multipliers[moves] = v / miss[-1] * unit / size[moves]
-    return solve_triangular(L, y - free, lower=True, trans="T"), multipliers
 
 
 def _slsqp(
@@ -328,6 +287,16 @@ def _slsqp(
         options={"maxiter": max_iterations, "ftol": 1e-13},
     )
     return np.asarray(found.x), int(found.status) == SLSQP_LIMIT, int(found.nit)
+
+
+def need_ipopt() -> None:
+    """Raise an ImportError that says what to install, unless IPOPT is there."""
+    try:
+        import ipyopt  # noqa: F401
+    except ImportError as error:
+        raise ImportError(
+            'solver="ipopt" needs the package ipyopt: pip install "prefmpc[ipopt]"'
+        ) from error
 
 
 def _ipopt(

@@ -100,6 +100,13 @@ def rows(problem: Problem, path: Any, horizon: int) -> int:
     return horizon * stage.size + jax.eval_shape(lambda x: _at_end(problem, x), x).size
 
 
+def path_sizes(path: Any, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return the sizes (m,) of path(x, u) where nothing moves: limits, or what terms are."""
+    cx, cu = jax.jacfwd(path, argnums=(0, 1))(x, u)
+    limit = jnp.abs(cx @ x + cu @ u - path(x, u))
+    return np.asarray(jnp.maximum(limit, jnp.abs(cx) @ np.abs(x) + jnp.abs(cu) @ np.abs(u)))
+
+
 class _Layout(NamedTuple):
     """How one vector holds a problem and what is given; and the parts that are not numbers."""
 
@@ -207,15 +214,23 @@ def slopes(known: Known, flat: Any, z: Any) -> tuple[Any, Any]:
     def joined(x: Any, u: Any) -> Any:
         return jnp.concatenate([x.ravel(), u.ravel()])
 
+    def largest(part: Any) -> Any:
+        return jnp.where(jnp.isfinite(part), jnp.abs(part), 0.0).max(0)
+
     S = jnp.concatenate([Sx.reshape(-1, z.size), Su.reshape(-1, z.size)])
     descent = jax.grad(lambda x, u: _cost(problem, given, x, u), argnums=(0, 1))
-    (gx, gu), bent = jax.jvp(descent, (X, U), (jnp.abs(X), reach_u))
-    pull, bent = joined(gx, gu), joined(*bent)
-    rounding = jnp.where(jnp.isfinite(bent), ROUNDING * jnp.abs(bent), 0.0)
-    parts = rounding[: X.size].reshape(X.shape), rounding[X.size :].reshape(U.shape)
-    # Late in a plan all pulls end: there an input counts beside the largest one.
-    parts = parts[0].max(0), parts[1].max(0) + jnp.abs(gu).max(0)
-    least = joined(*(jnp.broadcast_to(p, a.shape) for p, a in zip(parts, (X, U), strict=True)))
+    (gx, gu), bend = jax.linearize(descent, X, U)
+    rounding = [ROUNDING * largest(part) for part in bend(jnp.abs(X), reach_u)]
+    # Late in a plan all pulls end, and there are inputs that nothing needs: these count beside
+    # the largest of their kind, and in shares of their range beside the largest of all.
+    limited = jnp.isfinite(problem.system.u_min) & jnp.isfinite(problem.system.u_max)
+    shares = jnp.where(limited, jnp.abs(z).reshape(U.shape), 0.0)
+    usual = jnp.where(limited, shares.max() * problem.scale.reshape(U.shape), jnp.abs(U).max(0))
+    priced = jnp.maximum(largest(gu), largest(bend(jnp.zeros_like(X), usual)[1]))
+    least = joined(
+        jnp.broadcast_to(rounding[0], X.shape), jnp.broadcast_to(rounding[1] + priced, U.shape)
+    )
+    pull = joined(gx, gu)
     size = jnp.maximum(jnp.abs(pull), least) @ jnp.abs(S)
 
     on_stage = jax.vmap(lambda x, u: _on_stage(problem, path, x, u))

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Any, Literal, get_args
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
@@ -95,7 +94,7 @@ class NonlinearMPC(Controller):
         if solver not in get_args(Solver):
             raise ValueError(f"solver must be one of {get_args(Solver)}, got {solver!r}")
         if solver == "ipopt":
-            _need_ipopt()
+            _nlp.need_ipopt()
         self.system, self.cost = system, cost
         self.horizon = positive_int("horizon", horizon)
         self.solver, self.tol = solver, nonnegative("tol", tol)
@@ -251,16 +250,11 @@ class NonlinearMPC(Controller):
         if self._path is None:
             return
         excess = np.asarray(self._path(reference.x, reference.u))
-        if not (excess <= ON_LIMIT * self._path_sizes(reference)).all():
+        if (excess <= 0).all():
+            return
+        size = shooting.path_sizes(self._path, reference.x, reference.u)
+        if not (excess <= ON_LIMIT * size).all():
             raise ValueError(f"reference must satisfy path(x, u) ≤ 0, got {excess}")
-
-    def _path_sizes(self, reference: SteadyState) -> np.ndarray:
-        """Return the sizes (m,) of path(x, u) at a reference: what its terms are there."""
-        assert self._path is not None
-        cx, cu = jax.jacfwd(self._path, argnums=(0, 1))(reference.x, reference.u)
-        limit = cx @ reference.x + cu @ reference.u - self._path(reference.x, reference.u)
-        reach = jnp.abs(cx) @ np.abs(reference.x) + jnp.abs(cu) @ np.abs(reference.u)
-        return np.asarray(jnp.maximum(jnp.abs(limit), reach))
 
     def _starts(self, program: Any, reference: Any, start: Any) -> list[np.ndarray]:
         """Return scaled inputs to start from, the most promising first."""
@@ -277,17 +271,7 @@ class NonlinearMPC(Controller):
             plans.append(np.concatenate([self._plan[1:], rest[None]]))
         guesses = [np.clip(U.ravel() / scale, program.lower, program.upper) for U in plans]
 
-        if len(guesses) == 1:
-            return guesses
-        f, c = (np.array(part) for part in zip(*map(program.values, guesses), strict=True))
-        broken = np.zeros(len(f))
-        if (c > 0).any():
-            size = program.slopes(guesses[0]).near
-            broken = (np.maximum(c, 0) / np.where(size > 0, size, 1.0)).sum(axis=1)
-        largest = np.abs(f[np.isfinite(f)]).max(initial=0.0)
-        merit = f + 1e3 * largest * broken
-        order = np.lexsort((broken, np.where(np.isfinite(merit), merit, np.inf)))
-        return [guesses[i] for i in order[:2]]
+        return _nlp.promising(program, guesses)[:2]
 
     def _program(self, layout: Known, flat: Any) -> _nlp.Program:
         scale = self._problem.scale
@@ -361,15 +345,6 @@ class NonlinearMPC(Controller):
             seconds=time.perf_counter() - began,
         )
         return with_reference(solution, reference)
-
-
-def _need_ipopt() -> None:
-    try:
-        import ipyopt  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            'solver="ipopt" needs the package ipyopt: pip install "prefmpc[ipopt]"'
-        ) from error
 
 
 def _check_path(path: Callable[[Any, Any], Any], system: System) -> None:
