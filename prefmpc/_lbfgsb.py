@@ -36,7 +36,8 @@ def minimise(
     Returns
     -------
     (θ, iterations, error)
-        ``error`` is the largest entry of the projected gradient.
+        ``error`` is the largest entry of the projected gradient, NaN if the objective or an entry
+        of its gradient is not finite.
     """
     x0, unravel = ravel_pytree(start)
     lower, upper = ravel_pytree(bounds[0])[0], ravel_pytree(bounds[1])[0]
@@ -78,4 +79,6 @@ def _run(
         return x_new, state_new
 
     x, state = jax.lax.while_loop(unfinished, step, (x0, solver.init_state(x0, bounds)))
-    return x, state.iter_num, state.error
+    # A maximum may pass over NaN, and the projection turns an infinite slope into a short step.
+    known = jnp.isfinite(state.value) & jnp.isfinite(state.grad).all()
+    return x, state.iter_num, jnp.where(known, state.error, jnp.nan)

@@ -203,7 +203,9 @@ class Minimum(NamedTuple):
 
     def converged(self, tol: float) -> bool:
         """Whether the decrement certifies the minimum; the last step may have moved the value."""
-        return bool(self.decrement <= 1.01 * tol * (1 + abs(self.objective)))
+        numbers = [np.isfinite(part).all() for part in (self.w, self.objective, self.decrement)]
+        # Nothing is small beside an infinite objective.
+        return all(numbers) and bool(self.decrement <= 1.01 * tol * (1 + abs(self.objective)))
 
 
 TO_BOUNDARY = 0.95

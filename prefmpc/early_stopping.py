@@ -39,7 +39,8 @@ class NetworkFit:
         The check at which each restart was best.
     status : array of str (restarts,)
         "stopped": the validation loss had not fallen for ``patience`` checks; "max_epochs": it
-        was still falling; "not_finite".
+        was still falling; "not_finite": a loss or a weight left the numbers, and the restart is
+        not chosen.
     seconds : float
     """
 
@@ -114,7 +115,8 @@ def fit_network(
         Of Adam, with decay rates 0.9 and 0.999.
     max_epochs, patience : int
     batch_size : int
-        Data sets with more pairs are passed over in random mini-batches of this size.
+        Data sets with more pairs are passed over in random mini-batches, as few and as equal as
+        this size allows: in an epoch each pair comes up once.
     progress : bool
         Show a progress bar.
 
@@ -153,9 +155,10 @@ def fit_network(
         trained[~running], held[~running] = np.nan, np.nan
         histories[0].append(trained)
         histories[1].append(held)
-        finite &= ~running | (np.isfinite(held) & np.isfinite(trained))
-        better = running & finite & (held < lowest)
         models = to_numpy(state[0])
+        # A weight that is NaN need not show in the losses: a ReLU may pass over it.
+        finite &= ~running | (np.isfinite(held) & np.isfinite(trained) & _finite(models))
+        better = running & finite & (held < lowest)
         best = jax.tree.map(lambda old, new, b=better: _where(b, new, old), best, models)
         lowest, best_at = np.where(better, held, lowest), np.where(better, i, best_at)
         since = np.where(better, 0, since + 1)
@@ -163,7 +166,7 @@ def fit_network(
         if not running.any():
             break
     status = np.where(running, "max_epochs", "stopped").astype("<U10")
-    usable = np.isfinite(lowest)
+    usable = finite & np.isfinite(lowest)
     status[~usable] = "not_finite"
     result = NetworkFit(
         models=best,
@@ -203,15 +206,27 @@ def _where(mask: np.ndarray, new: Any, old: Any) -> Any:
     return np.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
 
-def _batches(n: int, padded: int, size: int, rng: np.random.Generator) -> np.ndarray | None:
-    """Return ten epochs of mini-batches (steps, size), or None for all pairs at once."""
+def _finite(models: Any) -> np.ndarray:
+    """Say which models of a stack have finite weights only."""
+    leaves = jax.tree.leaves(models)
+    return np.all([np.isfinite(leaf).reshape(len(leaf), -1).all(axis=1) for leaf in leaves], axis=0)
+
+
+def _batches(n: int, padded: int, size: int, rng: np.random.Generator) -> Any:
+    """Return ten epochs of mini-batches (rows, size) and how many rows to take of them.
+
+    None for all pairs at once. What is free in a row, and the rows that are not taken, hold the
+    index ``padded``, behind the last pair: one shape, and one compilation, for many data sets.
+    """
     if n <= size:
         return None
-    # The number of steps depends on the padded size alone: one compilation for many data sets.
-    count = max(1, padded // size)
-    orders = [rng.permutation(n) for _ in range(CHECK_EVERY)]
-    rows = [np.resize(order, count * size).reshape(count, size) for order in orders]
-    return np.concatenate(rows)
+    count = -(-n // size)
+    rows = np.full((CHECK_EVERY * -(-padded // size), size), padded)
+    for epoch in range(CHECK_EVERY):
+        parts = np.array_split(rng.permutation(n), count)
+        for row, part in zip(rows[epoch * count :], parts, strict=False):
+            row[: part.size] = part
+    return rows, CHECK_EVERY * count
 
 
 @jax.jit
@@ -231,21 +246,25 @@ def _advance(
     def one(model: Any, memory: Any) -> Any:
         bounds = model.bounds()
 
-        def step(carry: tuple[Any, Any], chosen: Any) -> Any:
-            part = data if batches is None else _part(data, chosen)
+        def step(k: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+            part = data if batches is None else _part(data, batches[0][k])
             slope = jax.grad(objective)(carry[0], part, l2)
-            return adam_step(*carry, slope, bounds, learning_rate), None
+            return adam_step(*carry, slope, bounds, learning_rate)
 
-        length = CHECK_EVERY if batches is None else None
-        (model, memory), _ = jax.lax.scan(step, (model, memory), batches, length=length)
+        steps = CHECK_EVERY if batches is None else batches[1]
+        model, memory = jax.lax.fori_loop(0, steps, step, (model, memory))
         return (model, memory), (cross_entropy(model, data), cross_entropy(model, test))
 
     return jax.vmap(one)(*state)
 
 
 def _part(data: PairData, chosen: Any) -> PairData:
-    """Return a mini-batch: only its own trajectories are scored."""
-    labels, weights = data.labels[chosen], data.weights[chosen]
+    """Return a mini-batch: only its own trajectories are scored.
+
+    An index behind the last pair stands for none: a weight of 0, with some other pair's numbers.
+    """
+    labels = data.labels[chosen]
+    weights = data.weights.at[chosen].get(mode="fill", fill_value=0.0)
     if data.sides is None:
         features = jax.tree.map(lambda leaf: leaf[chosen], data.features)
         return PairData(None, features, labels, weights)

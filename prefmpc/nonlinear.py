@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import lru_cache
 from typing import Any
 
 import jax
@@ -119,7 +118,7 @@ class NonlinearSystem(System):
         )
         if got != (nx,):
             raise ValueError(f"f must return ẋ, shape ({nx},), got shape {got}")
-        step = _runge_kutta(f, dt, positive_int("substeps", substeps))
+        step = RungeKutta(f, dt / positive_int("substeps", substeps), substeps)
         return cls(step, g, nx=nx, nu=nu, dt=dt, u_min=u_min, u_max=u_max)
 
     def step(self, x: Any, u: Any) -> Any:
@@ -168,25 +167,31 @@ def _shape_of(name: str, call: Callable[..., Any], *arguments: Any) -> tuple[int
     return tuple(shape)
 
 
-@lru_cache(maxsize=256)  # the same plant made twice is compiled once
-def _runge_kutta(f: Dynamics, dt: float, substeps: int) -> Dynamics:
-    h = dt / substeps
+@dataclasses.dataclass(frozen=True)
+class RungeKutta:
+    """The classical Runge–Kutta method as a function of (x, u): ``substeps`` steps of length ``h``.
 
-    def one(x: Any, u: Any) -> Any:
+    Equal ones are compiled once, and one can be pickled if f can.
+    """
+
+    f: Dynamics
+    h: float
+    substeps: int
+
+    def __call__(self, x: Any, u: Any) -> Any:
+        """Return the state (nx,) after all steps, with the input held."""
+        if self.substeps == 1:
+            return self._one(x, u)
+        # A loop of known length: compiled once whatever the length, and differentiable.
+        return jax.lax.fori_loop(0, self.substeps, lambda _, z: self._one(z, u), x)
+
+    def _one(self, x: Any, u: Any) -> Any:
+        f, h = self.f, self.h
         k1 = f(x, u)
         k2 = f(x + h / 2 * k1, u)
         k3 = f(x + h / 2 * k2, u)
         k4 = f(x + h * k3, u)
         return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
-
-    if substeps == 1:
-        return one
-
-    def step(x: Any, u: Any) -> Any:
-        # A loop of known length: compiled once whatever the length, and differentiable.
-        return jax.lax.fori_loop(0, substeps, lambda _, z: one(z, u), x)
-
-    return step
 
 
 def _batched(call: Callable[..., Any], *arrays: Any) -> Any:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
+import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
 from prefmpc._checks import positive
-from prefmpc.nonlinear import Dynamics, NonlinearSystem
+from prefmpc.nonlinear import NonlinearSystem
 
 GRAVITY = 9.81
 
@@ -53,10 +53,9 @@ def kinematic_bicycle(
     given = {"wheelbase": wheelbase, "steering_rate": steering_rate}
     for name, value in {**given, "brake": brake, "throttle": throttle}.items():
         positive(name, value)
-    flow, output = _bicycle(float(wheelbase))
     return NonlinearSystem.from_continuous(
-        flow,
-        output,
+        _Rolling(float(wheelbase)),
+        _BicycleOutput(float(wheelbase)),
         nx=4,
         nu=2,
         dt=dt,
@@ -65,18 +64,26 @@ def kinematic_bicycle(
     )
 
 
-@lru_cache
-def _bicycle(wheelbase: float) -> tuple[Dynamics, Any]:
-    def flow(x: Any, u: Any) -> Any:
+# Plants made twice are equal, so that they are compiled once; and these can be pickled.
+
+
+@dataclasses.dataclass(frozen=True)
+class _Rolling:
+    wheelbase: float
+
+    def __call__(self, x: Any, u: Any) -> Any:
         _, heading, steering, speed = x
-        turn = speed * jnp.tan(steering) / wheelbase
+        turn = speed * jnp.tan(steering) / self.wheelbase
         return jnp.stack([speed * jnp.sin(heading), turn, u[0], u[1]])
 
-    def output(x: Any) -> Any:
-        p, heading, steering, speed = x
-        return jnp.stack([p, heading, speed**2 * jnp.tan(steering) / wheelbase, speed])
 
-    return flow, output
+@dataclasses.dataclass(frozen=True)
+class _BicycleOutput:
+    wheelbase: float
+
+    def __call__(self, x: Any) -> Any:
+        p, heading, steering, speed = x
+        return jnp.stack([p, heading, speed**2 * jnp.tan(steering) / self.wheelbase, speed])
 
 
 def cart_pendulum(
@@ -115,22 +122,25 @@ def cart_pendulum(
     """
     for name, value in {"cart": cart, "bob": bob, "length": length, "force": force}.items():
         positive(name, value)
-    flow = _cart_pendulum(float(cart), float(bob), float(length))
+    flow = _CartPendulum(float(cart), float(bob), float(length))
     return NonlinearSystem.from_continuous(
         flow, _position_and_angle, nx=4, nu=1, dt=dt, u_min=-force, u_max=force
     )
 
 
-@lru_cache
-def _cart_pendulum(cart: float, bob: float, length: float) -> Dynamics:
-    def flow(x: Any, u: Any) -> Any:
+@dataclasses.dataclass(frozen=True)
+class _CartPendulum:
+    cart: float
+    bob: float
+    length: float
+
+    def __call__(self, x: Any, u: Any) -> Any:
         _, angle, speed, rate = x
+        bob, length = self.bob, self.length
         sin, cos = jnp.sin(angle), jnp.cos(angle)
         push = u[0] + bob * length * rate**2 * sin - bob * GRAVITY * sin * cos
-        acceleration = push / (cart + bob * sin**2)
+        acceleration = push / (self.cart + bob * sin**2)
         return jnp.stack([speed, rate, acceleration, (GRAVITY * sin - acceleration * cos) / length])
-
-    return flow
 
 
 def _position_and_angle(x: Any) -> Any:

@@ -17,6 +17,9 @@ from prefmpc.convex import MapResult, check, fit_map
 from prefmpc.losses import FitError, padded_size
 from prefmpc.priors import Structure, WishartPrior
 
+MODE_FOUND = 1e-6
+"""So near to its mode, in nats relative to the evidence, is what Laplace's method looks at."""
+
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class PriorChoice:
@@ -100,7 +103,17 @@ def choose_prior(
 
 def _evidence(problems: list[Any]) -> np.ndarray:
     Chart.of(problems[0])  # says what is wrong before anything is computed
-    return np.array([fit.log_evidence for fit in laplaces(problems, _minima(problems))])
+    found = laplaces(problems, _minima(problems))
+    bad = sum(
+        not (
+            np.isfinite(fit.log_evidence)
+            and fit.decrement <= MODE_FOUND * (1 + abs(fit.log_evidence))
+        )
+        for fit in found
+    )
+    if bad:
+        raise FitError(f"choose_prior: {bad} of {len(found)} evidences were not found")
+    return np.array([fit.log_evidence for fit in found])
 
 
 def _held_out(problems: list[Any], n: int, folds: int) -> np.ndarray:

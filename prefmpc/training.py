@@ -209,11 +209,11 @@ def fit(
 def best_restart(score: Any, status: np.ndarray, loss: np.ndarray) -> int | None:
     """Return the converged restart with the smallest score; equal scores are decided by the loss.
 
-    None if no restart converged to finite weights within the bounds.
+    None if no restart converged to finite weights within the bounds, with a finite score and loss.
     """
-    usable = status == "converged"
-    ranking = np.lexsort((loss, np.where(usable, score, np.inf)))
-    return int(ranking[0]) if usable.any() else None
+    usable = np.flatnonzero((status == "converged") & np.isfinite(score) & np.isfinite(loss))
+    ranking = np.lexsort((np.asarray(loss)[usable], np.asarray(score)[usable]))
+    return int(usable[ranking[0]]) if usable.size else None
 
 
 @jax.jit(static_argnums=(3, 4))
@@ -241,6 +241,9 @@ def _train(
             upper,
         )
         violation = jnp.maximum(jnp.max(jnp.stack(jax.tree.leaves(outside))), 0.0)
+        # A maximum may pass over NaN.
+        finite = [jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(model)]
+        violation = jnp.where(jnp.stack(finite).all(), violation, jnp.nan)
         # Rounding in the solver's Cauchy point; anything larger stays, and is reported.
         inside = jax.tree.map(jnp.clip, model, lower, upper)
         rounding = violation <= BOUND_ROUNDING

@@ -63,7 +63,8 @@ class Posterior:
     @property
     def success(self) -> bool:
         """Whether the chains agree: at least a tenth of the draws are worth independent ones."""
-        return bool(self.effective >= SMALLEST_SHARE * len(self.Q))
+        numbers = np.isfinite(self.w).all() and np.isfinite(self.effective)
+        return bool(numbers and self.effective >= SMALLEST_SHARE * len(self.Q))
 
     @property
     def message(self) -> str:

@@ -21,12 +21,15 @@ from prefmpc import (
     accuracy,
     blocks,
     bryson,
+    choose_prior,
+    convex,
     erring,
     fit_map,
     fit_maps,
     lqr_pool,
     oscillating_masses,
     second_moments,
+    selection,
 )
 from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
@@ -269,6 +272,42 @@ def test_an_unfinished_solve_says_so_and_hands_out_no_model():
     assert not result.success
     with pytest.raises(FitError, match="max_iterations"):
         _ = result.model
+
+
+@pytest.mark.parametrize("bad", [1.0, np.nan, np.inf])
+@pytest.mark.parametrize("place", ["decrement", "objective"])
+def test_only_a_small_finite_decrement_is_a_minimum(monkeypatch, place, bad):
+    true = convex.solve
+
+    def broken(*arguments):
+        value = -1.0 if (place, bad) == ("objective", 1.0) else bad
+        return [minimum._replace(**{place: value}) for minimum in true(*arguments)]
+
+    monkeypatch.setattr(convex, "solve", broken)
+    if (place, bad) == ("objective", 1.0):
+        assert fit_map(CLEAN, BRYSON).success  # any finite objective will do
+        return
+    with pytest.warns(RuntimeWarning, match="max_iterations|not_finite"):
+        assert not fit_map(CLEAN, BRYSON).success
+    monkeypatch.setattr(selection, "solve", broken)
+    with pytest.raises(FitError, match="1 of 1 problems were not solved"):
+        choose_prior(CLEAN, [BRYSON])
+
+
+@pytest.mark.parametrize("bad", [1.0, np.nan, np.inf])
+@pytest.mark.parametrize("place", ["decrement", "log_evidence"])
+def test_only_evidence_at_a_mode_counts(monkeypatch, place, bad):
+    true = selection.laplaces
+
+    def broken(*arguments):
+        return [found._replace(**{place: bad}) for found in true(*arguments)]
+
+    monkeypatch.setattr(selection, "laplaces", broken)
+    if (place, bad) == ("log_evidence", 1.0):
+        assert choose_prior(CLEAN, [BRYSON]).scores[0] == 1.0
+        return
+    with pytest.raises(FitError, match="1 of 1 evidences were not found"):
+        choose_prior(CLEAN, [BRYSON])
 
 
 @pytest.mark.parametrize(

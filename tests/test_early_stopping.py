@@ -13,12 +13,14 @@ from prefmpc import (
     MLPCost,
     QuadraticCost,
     accuracy,
+    early_stopping,
     fit_network,
     logistic,
     lqr_pool,
     oscillating_masses,
 )
-from prefmpc.losses import cross_entropy, pair_data
+from prefmpc.early_stopping import _batches, _part
+from prefmpc.losses import cross_entropy, padded_size, pair_data
 from prefmpc.studies import RADIUS
 
 KEY = jax.random.key(3000)
@@ -174,3 +176,41 @@ def network(comparisons=NOISY, initial=STARTS, **options):
 def test_bad_input_is_named(call, words):
     with pytest.raises(ValueError, match=words):
         call()
+
+
+@pytest.mark.parametrize(("n", "size"), [(1025, 1024), (1500, 1400), (2048, 256), (4097, 1024)])
+def test_an_epoch_takes_each_pair_once_whatever_the_sizes(n, size):
+    padded = padded_size(n)
+    rows, steps = _batches(n, padded, size, np.random.default_rng(0))
+    for epoch in np.split(rows[:steps], 10):
+        np.testing.assert_array_equal(np.sort(epoch[epoch < padded]), np.arange(n))
+        used = (epoch < padded).sum(axis=1)
+        assert used.max() - used.min() <= 1
+        assert len(used) == -(-n // size)
+    again, _ = _batches(n + 1 if n < padded else n - 1, padded, size, np.random.default_rng(0))
+    assert again.shape == rows.shape  # nothing to compile for another number of pairs
+    assert _batches(size, padded, size, np.random.default_rng(0)) is None
+
+
+def test_a_part_of_a_batch_that_is_free_counts_for_nothing():
+    data = jax.device_put(pair_data(STARTS, NOISY, 1024))
+    part = _part(data, np.array([3, 7, 1024, 1024]))
+    alone = _part(data, np.array([3, 7]))
+    assert float(cross_entropy(STARTS[0], part)) == pytest.approx(
+        float(cross_entropy(STARTS[0], alone)), rel=1e-12
+    )
+
+
+def test_a_weight_that_is_not_a_number_is_seen_though_the_losses_are_finite(monkeypatch):
+    advance = early_stopping._advance
+
+    def broken(*arguments):
+        (models, memory), losses = advance(*arguments)
+        models = jax.tree.map(lambda leaf: leaf.at[1].set(np.nan), models)
+        return (models, memory), losses
+
+    monkeypatch.setattr(early_stopping, "_advance", broken)
+    result = fit_network(NOISY, STARTS, key=KEY, max_epochs=10)
+    assert np.isfinite(result.validation_loss[0]).all()
+    assert result.status[1] == "not_finite"
+    assert result.chosen != 1

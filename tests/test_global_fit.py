@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+
 import jax
 import numpy as np
 import pytest
@@ -79,6 +81,23 @@ def test_a_model_that_was_not_found_is_not_handed_out(monkeypatch):
         result = module.fit_global(answers(1, 2301))
     with pytest.raises(FitError, match="max_iterations"):
         _ = result.model
+
+
+@pytest.mark.parametrize("bad", [1.0, np.nan, np.inf])
+@pytest.mark.parametrize("solver", ["barrier", "clarabel"])
+def test_only_a_small_finite_gap_is_a_minimum(monkeypatch, solver, bad):
+    module = sys.modules["prefmpc.global_fit"]
+    name = "_follow" if solver == "barrier" else "_certificate"
+    true = getattr(module, name)
+
+    def broken(*arguments):
+        out = list(true(*arguments))
+        out[2 if solver == "barrier" else 1] = bad
+        return tuple(out)
+
+    monkeypatch.setattr(module, name, broken)
+    with pytest.warns(RuntimeWarning, match="max_iterations|inaccurate"):
+        assert not fit_global(answers(1, 2301), solver=solver).success
 
 
 @pytest.mark.parametrize(

@@ -28,6 +28,7 @@ from prefmpc._lbfgsb import minimise
 from prefmpc._pytree import register_pytree
 from prefmpc.losses import PairData, cross_entropy, logits, objective, pair_data
 from prefmpc.studies import error_rates
+from prefmpc.training import best_restart
 
 KEY = jax.random.key(2000)
 RNG = np.random.default_rng(0)
@@ -464,3 +465,44 @@ LOSS = {"selection": "training_loss"}
 def test_bad_input_is_named(call, words):
     with pytest.raises(ValueError, match=words):
         call()
+
+
+# ---- a status depends on the number beside it ----
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_restart_without_a_finite_score_and_loss_is_never_chosen(bad):
+    mixed = np.array(["converged", "not_finite"])
+    assert best_restart([bad, 1.0], mixed, np.ones(2)) is None
+    assert best_restart(np.ones(2), mixed, np.array([bad, 1.0])) is None
+    both = np.array(["converged", "converged"])
+    assert best_restart(np.array([bad, 3.0]), both, np.ones(2)) == 1
+    assert best_restart([1.0, 1.0], both, [2.0, 1.0]) == 1
+
+
+@pytest.mark.parametrize("bad", [1.0, np.nan, np.inf])
+@pytest.mark.parametrize(("place", "status"), [(4, "max_iterations"), (5, "out_of_bounds")])
+def test_a_restart_converges_only_by_a_small_finite_number(monkeypatch, data, bad, place, status):
+    train = training._train
+
+    def broken(*arguments):
+        out = list(train(*arguments))
+        out[place] = np.full_like(out[place], bad)
+        return tuple(out)
+
+    monkeypatch.setattr(training, "_train", broken)
+    with pytest.warns(RuntimeWarning, match="none usable"):
+        result = fit(data[2][20], key=KEY, restarts=20)
+    assert (result.status == status).all()
+    assert result.chosen is None
+
+
+def test_an_infinite_slope_towards_a_bound_is_no_minimum():
+    # √x on x ≥ 0: the projected gradient at 0 is 0, the gradient itself infinite.
+    low, high = np.zeros(2), np.full(2, np.inf)
+    options = {"max_iterations": 50, "tol": 1e-3}
+    x, _, error = minimise(lambda x: jnp.sqrt(x).sum(), np.zeros(2), (low, high), **options)
+    assert (np.asarray(x) == 0).all()
+    assert np.isnan(error)
+    _, _, error = minimise(lambda x: jnp.sum((x - 1) ** 2), np.zeros(2), (low, high), **options)
+    assert error <= 1e-3

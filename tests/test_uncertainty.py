@@ -29,7 +29,7 @@ from prefmpc import (
 )
 from prefmpc._chart import Chart, laplaces
 from prefmpc.studies import RADIUS
-from prefmpc.uncertainty import effective_draws
+from prefmpc.uncertainty import Posterior, effective_draws
 
 POOL = lqr_pool(
     oscillating_masses(), 30, 10, key=jax.random.key(2100), radius=RADIUS, saturate=False
@@ -261,3 +261,12 @@ def test_an_unfinished_result_has_no_posterior():
         posterior(UNFINISHED)
     with pytest.raises(FitError, match="max_iterations"):
         _ = UNFINISHED.std_Q
+
+
+@pytest.mark.parametrize("bad", [1.0, np.nan, np.inf])
+def test_only_a_finite_number_of_draws_is_enough(bad):
+    numbers = {"acceptance": 1.0, "seconds": 0.0, "result": None}
+    Q, R, w = np.ones((320, 1, 1)), np.ones((320, 1, 1)), np.ones((320, 2))
+    assert Posterior(Q, R, effective=40.0, w=w, **numbers).success
+    assert not Posterior(Q, R, effective=bad, w=w, **numbers).success
+    assert not Posterior(Q, R, effective=40.0, w=w * np.inf, **numbers).success

@@ -7,11 +7,17 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from scipy.linalg import solve_triangular
 from scipy.optimize import minimize, nnls
 
+from prefmpc.mpc._limits import ON_LIMIT
+from prefmpc.mpc._quadratic import convex, quadratic_program
+from prefmpc.mpc._shooting import Slopes
+
 ACTIVE = 1e-6
-"""A constraint this close to its limit may carry a multiplier."""
+"""A constraint this close to its limit, relative to its size, may carry a multiplier."""
+
+FEASIBLE = ON_LIMIT
+"""How far beyond its limit a constraint may be, relative to its size."""
 
 SLSQP_LIMIT = 9  # SLSQP's code for the iteration limit; IPOPT's is below
 IPOPT_LIMIT = -1
@@ -21,6 +27,9 @@ NEWTON_STEPS = 60
 SHORTEST = 1e-3
 """Newton steps that have to be shorter than this fraction lead nowhere."""
 
+BALANCED = 1e-11
+"""A point whose slopes are balanced so well, relative to their terms, needs no further step."""
+
 REMEMBERED = 4
 
 
@@ -28,36 +37,38 @@ REMEMBERED = 4
 class Program:
     """Functions of z (n,), already compiled.
 
+    All is in units in which the numbers here have a meaning; see `own_units`.
+
     Attributes
     ----------
     values : z → f, c (m,)
-    slopes : z → ∇f (n,), ∂c/∂z (m, n)
+    slopes : z → ∇f (n,), ∂c/∂z (m, n), and the sizes of both
     curvature : z, multipliers (m,), factor → factor·∇²f + Σ_i multiplier_i ∇²c_i, (n, n)
     lower, upper : array (n,)
     rows : m
     """
 
     values: Callable[[Any], tuple[float, np.ndarray]]
-    slopes: Callable[[Any], tuple[np.ndarray, np.ndarray]]
+    slopes: Callable[[Any], Slopes]
     curvature: Callable[[Any, Any, float], np.ndarray]
     lower: np.ndarray
     upper: np.ndarray
     rows: int
 
 
-def remembered(function: Callable[[np.ndarray], Any]) -> Callable[[np.ndarray], Any]:
-    """Return the function of z, which looks up its latest answers instead of computing them again.
+def remembered(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the function, which looks up its latest answers instead of computing them again.
 
     Who chooses where to start, the solvers and the check at the end ask about the same points.
     """
-    answers: dict[bytes, Any] = {}
+    answers: dict[tuple[bytes, ...], Any] = {}
 
-    def ask(z: np.ndarray) -> Any:
-        point = z.tobytes()
+    def ask(*arrays: np.ndarray) -> Any:
+        point = tuple(array.tobytes() for array in arrays)
         if point not in answers:
             if len(answers) == REMEMBERED:
                 del answers[next(iter(answers))]
-            answers[point] = function(z)
+            answers[point] = function(*arrays)
         return answers[point]
 
     return ask
@@ -73,9 +84,14 @@ class Attempt:
     violation: float
     residual: float
 
-    def good(self, feasibility: float, optimality: float) -> bool:
-        """Whether the point satisfies the constraints and the conditions for a minimum."""
-        return self.violation <= feasibility and self.residual <= optimality
+    @property
+    def feasible(self) -> bool:
+        """Whether the point satisfies the constraints."""
+        return bool(self.violation <= FEASIBLE)
+
+    def good(self, tol: float) -> bool:
+        """Whether it also satisfies the conditions for a minimum."""
+        return self.feasible and bool(self.residual <= tol)
 
 
 def attempt(
@@ -83,24 +99,38 @@ def attempt(
 ) -> Attempt:
     """Run a solver from ``start``, and judge where it stops without trusting what it says."""
     z = np.clip(start, program.lower, program.upper)
+    if not z.size:  # every input is locked
+        return _judge(program, z, False, 0)
     if solver == "ipopt":
         return _judge(program, *_ipopt(program, z, max_iterations))
     best = _judge(program, *_newton(program, z, min(max_iterations, NEWTON_STEPS)))
-    if best.good(ACTIVE, tol):
+    if best.good(tol):
         return best
     # Quasi-Newton steps take over; a fresh matrix often gets on from where an old one was stuck.
-    count, begin = best.iterations, best.z if best.violation <= ACTIVE else z
+    count, begin = best.iterations, best.z if best.feasible else z
     for _ in range(2):
         z, limited, more = _slsqp(program, begin, max_iterations)
         again = _judge(program, z, limited, count + more)
-        if best.violation > ACTIVE or (
-            again.residual < best.residual and again.violation <= ACTIVE
-        ):
+        if not best.feasible or (again.residual < best.residual and again.feasible):
             best = again
         count, begin = again.iterations, again.z
-        if again.good(ACTIVE, tol) or again.limited or again.violation > ACTIVE:
+        if again.good(tol) or again.limited or not again.feasible:
             break
     return dataclasses.replace(best, iterations=count, limited=again.limited)
+
+
+def promising(program: Program, guesses: list[np.ndarray]) -> list[np.ndarray]:
+    """Return the points to start from, the most promising first: small f, few limits broken."""
+    if len(guesses) == 1:
+        return guesses
+    f, c = (np.array(part) for part in zip(*map(program.values, guesses), strict=True))
+    broken = np.zeros(len(f))
+    if (c > 0).any():
+        size = program.slopes(guesses[0]).near
+        broken = (np.maximum(c, 0) / np.where(size > 0, size, 1.0)).sum(axis=1)
+    merit = f + 1e3 * np.abs(f[np.isfinite(f)]).max(initial=0.0) * broken
+    order = np.lexsort((broken, np.where(np.isfinite(merit), merit, np.inf)))
+    return [guesses[i] for i in order]
 
 
 def least_violation(program: Program, start: np.ndarray) -> tuple[np.ndarray, float]:
@@ -111,47 +141,67 @@ def least_violation(program: Program, start: np.ndarray) -> tuple[np.ndarray, fl
         if not np.isfinite(c).all():
             return HUGE, np.zeros_like(z)
         excess = np.maximum(c, 0)
-        return float(excess @ excess) / 2, excess @ program.slopes(z)[1]
+        return float(excess @ excess) / 2, excess @ program.slopes(z).jacobian
 
     box = list(zip(program.lower, program.upper, strict=True))
     inside = np.clip(start, program.lower, program.upper)
-    found = minimize(value_and_slope, inside, jac=True, bounds=box, method="L-BFGS-B")
-    return found.x, max(0.0, float(np.max(program.values(found.x)[1], initial=0.0)))
+    options = {"ftol": 1e-15, "gtol": 1e-10}  # half the square of what is feasible, and less
+    found = minimize(
+        value_and_slope, inside, jac=True, bounds=box, method="L-BFGS-B", options=options
+    )
+    z = np.clip(found.x, program.lower, program.upper)
+    return z, _violation(program, z)
+
+
+def _violation(program: Program, z: np.ndarray) -> float:
+    """Return the largest violation of a constraint, relative to its size; ∞ if it is unknown."""
+    f, c = program.values(z)
+    if not (np.isfinite(f) and np.isfinite(c).all()):
+        return np.inf
+    if not (c > 0).any():
+        return 0.0
+    size = program.slopes(z).rows
+    excess = np.maximum(c, 0.0) / np.where(size > 0, size, 1.0)
+    return float(excess.max()) if np.isfinite(excess).all() else np.inf
 
 
 def _judge(program: Program, z: np.ndarray, limited: bool, iterations: int) -> Attempt:
     z = np.clip(z, program.lower, program.upper)
-    value, c = program.values(z)
-    if not (np.isfinite(value) and np.isfinite(c).all()):
-        return Attempt(z, limited, iterations, np.inf, np.inf)
-    violation = max(0.0, float(np.max(c, initial=0.0)))
-    return Attempt(z, limited, iterations, violation, stationarity(program, z, c))
+    violation = _violation(program, z)
+    residual = stationarity(program, z) if np.isfinite(violation) else np.inf
+    return Attempt(z, limited, iterations, violation, residual)
 
 
-def stationarity(program: Program, z: np.ndarray, c: np.ndarray) -> float:
-    """Return how far ∇f is from what active constraints can balance, relative to 1 + ‖∇f‖∞.
+def stationarity(program: Program, z: np.ndarray) -> float:
+    """Return how far ∇f is from what active constraints can balance, relative to its terms' size.
 
-    The multipliers are the best nonnegative ones, from a least-squares problem of their own.
+    The multipliers are the best nonnegative ones, from a least-squares problem of their own. ∞ if
+    anything is unknown.
     """
-    slope, jacobian = program.slopes(z)
-    if not (np.isfinite(slope).all() and np.isfinite(jacobian).all()):
+    c = program.values(z)[1]
+    slope, jacobian, size, rows, _ = program.slopes(z)
+    if not all(np.isfinite(part).all() for part in (slope, jacobian, size, rows)):
         return np.inf
     eye = np.eye(z.size)
     width = np.minimum(program.upper - program.lower, 1.0)
     pushing = np.concatenate(
         [
-            jacobian[c > -ACTIVE],
+            jacobian[c > -ACTIVE * rows],
             eye[program.upper - z <= ACTIVE * width],
             -eye[z - program.lower <= ACTIVE * width],
         ]
     )
     rest = slope
-    if len(pushing):
-        size = np.maximum(np.linalg.norm(pushing, axis=1), 1e-12)
-        directions = (pushing / size[:, None]).T
-        multipliers, _ = nnls(directions, -slope, maxiter=30 * len(pushing))
+    if pushing.size:
+        length = np.maximum(np.linalg.norm(pushing, axis=1), 1e-12)
+        directions = (pushing / length[:, None]).T
+        try:
+            multipliers, _ = nnls(directions, -slope, maxiter=30 * len(pushing))
+        except RuntimeError:
+            return np.inf
         rest = slope + directions @ multipliers
-    return float(np.abs(rest).max() / (1 + np.abs(slope).max()))
+    # Each input for itself: in an unstable plant the first ones matter far more than the last.
+    return float((np.abs(rest) / np.where(size > 0, size, 1.0)).max(initial=0.0))
 
 
 def _newton(program: Program, z: np.ndarray, steps: int) -> tuple[np.ndarray, bool, int]:
@@ -167,13 +217,17 @@ def _newton(program: Program, z: np.ndarray, steps: int) -> tuple[np.ndarray, bo
     every = np.zeros(program.rows + int(up.sum()) + int(down.sum()))
     weight = 0.0
     for count in range(1, steps + 1):
-        slope, jacobian = program.slopes(z)
+        slope, jacobian, size, *_ = program.slopes(z)
+        A = np.concatenate([jacobian, eye[up], -eye[down]])
+        b = np.concatenate([-c, (program.upper - z)[up], (z - program.lower)[down]])
+        size = np.maximum(size, 1e-300)
+        missing = (slope + every @ A) / size, every * b / size.max(), np.minimum(b, 0)
+        if all((np.abs(m) <= BALANCED).all() for m in missing):
+            return z, False, count - 1
         H = program.curvature(z, every[: program.rows], 1.0)
         if not (np.isfinite(slope).all() and np.isfinite(jacobian).all() and np.isfinite(H).all()):
             return z, False, count
-        A = np.concatenate([jacobian, eye[up], -eye[down]])
-        b = np.concatenate([-c, (program.upper - z)[up], (z - program.lower)[down]])
-        H, exact = _convex((H + H.T) / 2, A[every > 0])
+        H, exact = convex((H + H.T) / 2, A[every > 0])
         found = quadratic_program(H, slope, A, b)
         if found is None:
             return z, False, count
@@ -187,68 +241,20 @@ def _newton(program: Program, z: np.ndarray, steps: int) -> tuple[np.ndarray, bo
             f, c = program.values(trial)
             after = f + weight * np.maximum(c, 0).sum()
             # Rounding may raise the merit a little where nothing is left to gain.
-            if after <= before + 1e-4 * length * gain + 1e-12 * (1 + abs(before)):
+            slack = 1e-12 * (abs(before) + weight)
+            if after <= before + 1e-4 * length * gain + slack:
                 break
             length /= 2
             if length < SHORTEST:
                 return z, False, count
         z = trial
-        if length == 1 and np.abs(d).max() <= (1e-6 if exact else 1e-9):
+        # The next step is the square of this one; what counts is its size beside the plan's. A tiny
+        # step that the line search shortens is rounding.
+        near = np.sqrt(min(1.0, float(np.abs(z).max())))
+        small = (1e-6 if exact else 1e-9) if length == 1 else 1e-8
+        if np.abs(d).max() <= max(small * near, 1e-300):
             return z, False, count
     return z, True, steps
-
-
-def _convex(H: np.ndarray, active: np.ndarray) -> tuple[np.ndarray, bool]:
-    """Return H, or the like with positive curvature, and whether steps along ``active`` keep it."""
-    values, vectors = np.linalg.eigh(H)
-    largest = max(float(np.abs(values).max()), 1e-8)
-    floor = 1e-8 * largest
-    if values[0] <= floor and len(active):
-        # Curvature across active constraints changes no step that stays on them.
-        normals = active / np.maximum(np.linalg.norm(active, axis=1), 1e-12)[:, None]
-        H = H + 10 * largest * normals.T @ normals
-        values, vectors = np.linalg.eigh(H)
-    if values[0] > floor:
-        return H, True
-    return (vectors * np.maximum(np.abs(values), floor)) @ vectors.T, False
-
-
-def quadratic_program(
-    H: np.ndarray, q: np.ndarray, A: np.ndarray, b: np.ndarray
-) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return d with the least qᵀd + dᵀHd/2 under A d ≤ b, and multipliers; None if there is none.
-
-    With H = LLᵀ this is the search for the point y = Lᵀd + L⁻¹q of a polyhedron nearest to the
-    origin, whose multipliers are a nonnegative least-squares problem (Lawson and Hanson, Solving
-    Least Squares Problems, chapter 23).
-    """
-    try:
-        L = np.linalg.cholesky(H)
-    except np.linalg.LinAlgError:
-        return None
-    free = solve_triangular(L, q, lower=True)
-    G = solve_triangular(L, A.T, lower=True).T
-    size = np.linalg.norm(G, axis=1)
-    moves = size > 1e-12  # the others hold or not, whatever d is
-    if (b[~moves] < -ACTIVE).any():
-        return None
-    G, h = G[moves] / size[moves, None], b[moves] / size[moves]
-    h = h + G @ free
-    y, multipliers = np.zeros(len(q)), np.zeros(len(b))
-    if (h < 0).any():  # else y = 0 will do
-        unit = -float(h.min())
-        target = np.eye(len(q) + 1)[-1]
-        rows = np.concatenate([-G.T, -h[None] / unit])
-        try:
-            v, rest = nnls(rows, target, maxiter=30 * len(h))
-        except RuntimeError:
-            return None
-        miss = target - rows @ v
-        if rest < 1e-10 or miss[-1] <= 1e-14:
-            return None
-        y = -miss[:-1] / miss[-1] * unit
-        multipliers[moves] = v / miss[-1] * unit / size[moves]
-    return solve_triangular(L, y - free, lower=True, trans="T"), multipliers
 
 
 def _slsqp(
@@ -260,22 +266,37 @@ def _slsqp(
             return f, c
         return HUGE, np.zeros_like(c)  # a trial step that leaves the numbers is only too long
 
-    size = 1 + abs(values(start)[0])
+    size = float(program.slopes(start).size.max()) or 1.0
+    size = size if np.isfinite(size) else 1.0
     constraints = []
     if program.rows:
         constraints = [
-            {"type": "ineq", "fun": lambda z: -values(z)[1], "jac": lambda z: -program.slopes(z)[1]}
+            {
+                "type": "ineq",
+                "fun": lambda z: -values(z)[1],
+                "jac": lambda z: -program.slopes(z).jacobian,
+            }
         ]
     found = minimize(
         lambda z: values(z)[0] / size,
         start,
-        jac=lambda z: program.slopes(z)[0] / size,
+        jac=lambda z: program.slopes(z).gradient / size,
         bounds=list(zip(program.lower, program.upper, strict=True)),
         constraints=constraints,
         method="SLSQP",
         options={"maxiter": max_iterations, "ftol": 1e-13},
     )
     return np.asarray(found.x), int(found.status) == SLSQP_LIMIT, int(found.nit)
+
+
+def need_ipopt() -> None:
+    """Raise an ImportError that says what to install, unless IPOPT is there."""
+    try:
+        import ipyopt  # noqa: F401
+    except ImportError as error:
+        raise ImportError(
+            'solver="ipopt" needs the package ipyopt: pip install "prefmpc[ipopt]"'
+        ) from error
 
 
 def _ipopt(
@@ -290,13 +311,13 @@ def _ipopt(
         return program.values(z)[0]
 
     def gradient(z: np.ndarray, out: np.ndarray) -> None:
-        out[:] = program.slopes(z)[0]
+        out[:] = program.slopes(z).gradient
 
     def limits(z: np.ndarray, out: np.ndarray) -> None:
         out[:] = program.values(z)[1]
 
     def jacobian(z: np.ndarray, out: np.ndarray) -> None:
-        out[:] = program.slopes(z)[1].ravel()
+        out[:] = program.slopes(z).jacobian.ravel()
 
     lower_rows, lower_columns = np.tril_indices(n)
 
@@ -324,7 +345,7 @@ def _ipopt(
         hessian,
         intermediate_callback=each_iteration,
         ipopt_options={
-            **{"print_level": 0, "sb": "yes", "max_iter": max_iterations, "tol": 1e-9},
+            **{"print_level": 0, "sb": "yes", "max_iter": max_iterations, "tol": 1e-11},
             **{"mu_strategy": "adaptive", "bound_relax_factor": 0.0},
         },
     )

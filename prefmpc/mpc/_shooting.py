@@ -16,8 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from prefmpc._pytree import bypass_init
+from prefmpc.mpc._limits import input_size
 from prefmpc.systems import System
 from prefmpc.trajectories import Trajectory
+
+ROUNDING = 1e-10
+"""Of σ's slopes, what they would be without a reference: less is lost in its digits."""
 
 
 class Problem(NamedTuple):
@@ -96,6 +100,13 @@ def rows(problem: Problem, path: Any, horizon: int) -> int:
     return horizon * stage.size + jax.eval_shape(lambda x: _at_end(problem, x), x).size
 
 
+def path_sizes(path: Any, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Return the sizes (m,) of path(x, u) where nothing moves: limits, or what terms are."""
+    cx, cu = jax.jacfwd(path, argnums=(0, 1))(x, u)
+    limit = jnp.abs(cx @ x + cu @ u - path(x, u))
+    return np.asarray(jnp.maximum(limit, jnp.abs(cx) @ np.abs(x) + jnp.abs(cu) @ np.abs(u)))
+
+
 class _Layout(NamedTuple):
     """How one vector holds a problem and what is given; and the parts that are not numbers."""
 
@@ -152,7 +163,7 @@ def values(known: Known, flat: Any, z: Any) -> tuple[Any, Any]:
 
 
 def _sensitivities(problem: Problem, X: Any, U: Any) -> tuple[Any, Any, Any]:
-    """Return A_k, and ∂x_k/∂z (N + 1, nx, n) and ∂u_k/∂z (N, nu, n)."""
+    """Return A_k and B_k, ∂x_k/∂z (N + 1, nx, n) and ∂u_k/∂z (N, nu, n)."""
     N, nu = U.shape
     A, B = jax.vmap(jax.jacfwd(problem.system.step, argnums=(0, 1)))(X[:-1], U)
     Su = (jnp.eye(N * nu) * problem.scale).reshape(N, nu, N * nu)
@@ -164,28 +175,90 @@ def _sensitivities(problem: Problem, X: Any, U: Any) -> tuple[Any, Any, Any]:
 
     start = jnp.zeros((X.shape[1], N * nu))
     _, Sx = jax.lax.scan(step, start, (A, B @ Su))
-    return A, jnp.concatenate([start[None], Sx]), Su
+    return (A, B), jnp.concatenate([start[None], Sx]), Su
+
+
+class Slopes(NamedTuple):
+    """Derivatives with respect to z, and the sizes of what they are sums and differences of.
+
+    The size of a slope of σ is the sum of its terms' absolute values, that of a constraint is as in
+    `_limits.row_sizes`.
+    """
+
+    gradient: Any
+    """∇σ (n,)"""
+    jacobian: Any
+    """∂c/∂z (m, n)"""
+    size: Any
+    """(n,)"""
+    rows: Any
+    """(m,): the largest along the plan, for constraints that come again in each stage."""
+    near: Any
+    """(m,): each in its own stage."""
+
+    @classmethod
+    def of(cls, table: Any, sizes: Any) -> Slopes:
+        """Take apart what `slopes` returns."""
+        table = np.asarray(table)
+        return cls(table[0], table[2:], table[1], *np.asarray(sizes))
 
 
 @jax.jit(static_argnums=0)
 def slopes(known: Known, flat: Any, z: Any) -> tuple[Any, Any]:
-    """Return ∇σ (n,) and ∂c/∂z (m, n)."""
+    """Return what `Slopes` are made of: each array more that is returned takes time."""
     problem, given, path, X, U = _unpacked(known, flat, z)
-    _, Sx, Su = _sensitivities(problem, X, U)
-    gx, gu = jax.grad(lambda x, u: _cost(problem, given, x, u), argnums=(0, 1))(X, U)
-    gradient = jnp.einsum("kx,kxn->n", gx, Sx) + jnp.einsum("ku,kun->n", gu, Su)
-    on_stage = jax.jacfwd(lambda x, u: _on_stage(problem, path, x, u), argnums=(0, 1))
-    cx, cu = jax.vmap(on_stage)(X[:-1], U)
+    (A, B), Sx, Su = _sensitivities(problem, X, U)
+    largest_u = input_size(jnp.asarray(problem.system.u_min), problem.system.u_max)
+    reach_u = jnp.maximum(jnp.abs(U), largest_u)
+
+    def joined(x: Any, u: Any) -> Any:
+        return jnp.concatenate([x.ravel(), u.ravel()])
+
+    def largest(part: Any) -> Any:
+        return jnp.where(jnp.isfinite(part), jnp.abs(part), 0.0).max(0)
+
+    S = jnp.concatenate([Sx.reshape(-1, z.size), Su.reshape(-1, z.size)])
+    descent = jax.grad(lambda x, u: _cost(problem, given, x, u), argnums=(0, 1))
+    (gx, gu), bend = jax.linearize(descent, X, U)
+    rounding = [ROUNDING * largest(part) for part in bend(jnp.abs(X), reach_u)]
+    # Late in a plan all pulls end, and there are inputs that nothing needs: these count beside
+    # the largest of their kind, and in shares of their range beside the largest of all.
+    limited = jnp.isfinite(problem.system.u_min) & jnp.isfinite(problem.system.u_max)
+    shares = jnp.where(limited, jnp.abs(z).reshape(U.shape), 0.0)
+    usual = jnp.where(limited, shares.max() * problem.scale.reshape(U.shape), jnp.abs(U).max(0))
+    priced = jnp.maximum(largest(gu), largest(bend(jnp.zeros_like(X), usual)[1]))
+    least = joined(
+        jnp.broadcast_to(rounding[0], X.shape), jnp.broadcast_to(rounding[1] + priced, U.shape)
+    )
+    pull = joined(gx, gu)
+    size = jnp.maximum(jnp.abs(pull), least) @ jnp.abs(S)
+
+    on_stage = jax.vmap(lambda x, u: _on_stage(problem, path, x, u))
+    cx, cu = jax.vmap(jax.jacfwd(lambda x, u: _on_stage(problem, path, x, u), argnums=(0, 1)))(
+        X[:-1], U
+    )
     stages = (cx @ Sx[:-1] + cu @ Su).reshape(-1, z.size)
-    end = jax.jacfwd(lambda x: _at_end(problem, x))(X[-1]) @ Sx[-1]
-    return gradient, jnp.concatenate([stages, end])
+    limit = jnp.einsum("kmx,kx->km", cx, X[:-1]) + jnp.einsum("kmu,ku->km", cu, U)
+    limit = jnp.abs(limit - on_stage(X[:-1], U))  # h of a row H x ≤ h
+    step = jnp.einsum("kij,kj->ki", jnp.abs(A), jnp.abs(X[:-1])) + jnp.abs(B) @ largest_u
+    reach = jnp.maximum(jnp.abs(X[:-1]), step)
+    reach = jnp.einsum("kmx,kx->km", jnp.abs(cx), reach)
+    near = jnp.maximum(limit, reach + jnp.einsum("kmu,ku->km", jnp.abs(cu), reach_u))
+
+    ex = jax.jacfwd(lambda x: _at_end(problem, x))(X[-1])
+    limit = jnp.abs(ex @ X[-1] - _at_end(problem, X[-1]))
+    ends = jnp.maximum(limit, jnp.abs(ex) @ jnp.abs(X).max(0))
+    table = jnp.concatenate([(pull @ S)[None], size[None], stages, ex @ Sx[-1]])
+    along = jnp.tile(near.max(0), len(U))
+    rows = [jnp.concatenate([along, ends]), jnp.concatenate([near.ravel(), ends])]
+    return table, jnp.stack(rows)
 
 
 @jax.jit(static_argnums=0)
 def curvature(known: Known, flat: Any, z: Any, multipliers: Any, factor: Any) -> Any:
     """Return factor·∇²σ + Σ_i multiplier_i ∇²c_i, (n, n)."""
     problem, given, path, X, U = _unpacked(known, flat, z)
-    A, Sx, Su = _sensitivities(problem, X, U)
+    (A, _), Sx, Su = _sensitivities(problem, X, U)
     nx, n = X.shape[1], z.size
     S = jnp.concatenate([Sx.reshape(-1, n), Su.reshape(-1, n)])
     at = jnp.concatenate([X.ravel(), U.ravel()])

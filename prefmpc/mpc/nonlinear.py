@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import threading
 import time
 from collections.abc import Callable
 from typing import Any, Literal, get_args
@@ -24,7 +26,9 @@ from prefmpc._pytree import bypass_init
 from prefmpc.models import CostModel, check_model
 from prefmpc.mpc import _nlp
 from prefmpc.mpc import _shooting as shooting
+from prefmpc.mpc._limits import ON_LIMIT
 from prefmpc.mpc._shooting import Given, Known, Problem
+from prefmpc.mpc._units import own_units
 from prefmpc.mpc.solution import (
     Controller,
     MPCSolution,
@@ -38,7 +42,6 @@ from prefmpc.systems import System
 from prefmpc.trajectories import Trajectory
 
 Solver = Literal["slsqp", "ipopt"]
-FEASIBLE = 1e-6
 
 
 class NonlinearMPC(Controller):
@@ -67,7 +70,8 @@ class NonlinearMPC(Controller):
         Newton steps on quadratic programs, with SciPy's SLSQP where these do not arrive; or IPOPT
         (``pip install prefmpc[ipopt]``). Both with exact second derivatives.
     tol : float
-        How far ∇σ, relative to 1 + ‖∇σ‖∞, may be from what active constraints balance.
+        How far ∇σ may be from what active constraints balance, relative to the size of the terms
+        that it is the sum of: in any units of σ, states and inputs the same.
     max_iterations : int
 
     Raises
@@ -97,7 +101,7 @@ class NonlinearMPC(Controller):
         single("cost", cost)
         choice("solver", solver, get_args(Solver))
         if solver == "ipopt":
-            _need_ipopt()
+            _nlp.need_ipopt()
         self.system, self.cost = system, cost
         self.horizon = positive_int("horizon", horizon)
         self.solver, self.tol = solver, nonnegative("tol", tol)
@@ -108,8 +112,17 @@ class NonlinearMPC(Controller):
             _check_path(path, system)
         self._problem = self._sets(constraints, terminal)
         self._rows = shooting.rows(self._problem, path, self.horizon)
+        self._lock = threading.RLock()  # a solve starts from the plan of the one before
         self.reset()
         self._check_cost()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all but the lock, which no copy can share."""
+        return {name: value for name, value in self.__dict__.items() if name != "_lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take over another controller's state, with a lock of one's own."""
+        self.__dict__.update(state, _lock=threading.RLock())
 
     def _sets(self, constraints: Any, terminal: Any) -> Problem:
         nx, nu = self.system.nx, self.system.nu
@@ -137,12 +150,14 @@ class NonlinearMPC(Controller):
 
     def reset(self) -> None:
         """Forget the last plan and the last input."""
-        self._plan: np.ndarray | None = None
-        self._applied = np.full(self.system.nu, np.nan)
+        with self._lock:
+            self._plan: np.ndarray | None = None
+            self._applied = np.full(self.system.nu, np.nan)
 
     def applied(self, u: np.ndarray) -> None:
         """Take note of an input that the plant received: the next Δu starts there."""
-        self._applied = np.asarray(u)
+        with self._lock:
+            self._applied = np.asarray(u)
 
     def solve(
         self,
@@ -168,32 +183,62 @@ class NonlinearMPC(Controller):
         """
         state = check_single_state(x0, self.system.nx)
         began = time.perf_counter()
-        packed = self._packed(state, reference, u_before)
-        program = self._program(*packed)
-        tries = []
+        with self._lock:
+            packed = self._packed(state, reference, u_before)
+            program = self._program(*packed)
+            tries, message = self._tried(program, state, self._starts(program, reference, start))
+            return self._solution(packed, reference, tries, message, began)
+
+    def _tried(
+        self, program: _nlp.Program, state: np.ndarray, guesses: list[np.ndarray]
+    ) -> tuple[list[_nlp.Attempt], str]:
+        """Return what came of each start, the last one good if any is, and what there is to say."""
+        tries: list[_nlp.Attempt] = []
         message = ""
-        for guess in self._starts(program, reference, start):
+        for guess in guesses:
             value, c = program.values(guess)
             if not (np.isfinite(value) and np.isfinite(c).all()):
                 message = "f, g, path or σ returns NaN or infinity along the plan to start from"
                 continue
-            tries.append(_nlp.attempt(program, guess, self.solver, self.max_iterations, self.tol))
-            if tries[-1].good(FEASIBLE, self.tol):
+            if (beyond := self._beyond(program, guess)) > 0:
+                wrong = f"x(0) itself is beyond a limit by {beyond:.2g} of its size"
+                return [], f"{infeasible_message(state, self.horizon)}: {wrong}"
+            own, units = own_units(program, guess, self.system.nu)
+
+            def run(z: np.ndarray, own: Any = own, units: Any = units) -> bool:
+                found = _nlp.attempt(own, z, self.solver, self.max_iterations, self.tol)
+                tries.append(dataclasses.replace(found, z=units.whole(found.z)))
+                return found.good(self.tol)
+
+            if run(units.part(guess)):
                 break
-            if tries[-1].violation > FEASIBLE:
-                nearer, violation = _nlp.least_violation(program, tries[-1].z)
-                if violation > FEASIBLE:
+            if tries[-1].feasible and not tries[-1].limited:  # in units of where it stopped
+                own, units = own_units(program, tries[-1].z, self.system.nu)
+                if run(units.part(tries[-1].z), own, units):
+                    break
+            if not tries[-1].feasible:
+                nearer, violation = _nlp.least_violation(own, units.part(tries[-1].z))
+                if not violation <= _nlp.FEASIBLE:
                     message = (
                         f"{infeasible_message(state, self.horizon)}: the best plan found breaks "
-                        f"them by {violation:.2g}"
+                        f"them by {violation:.2g} of their size"
                     )
                     continue
-                tries.append(
-                    _nlp.attempt(program, nearer, self.solver, self.max_iterations, self.tol)
-                )
-                if tries[-1].good(FEASIBLE, self.tol):
+                if run(nearer):
                     break
-        return self._solution(packed, reference, tries, message, began)
+        return tries, message
+
+    def _beyond(self, program: _nlp.Program, guess: np.ndarray) -> float:
+        """Return how far x_0 is beyond limits that no input moves, 0 if it counts as on them."""
+        if self._constraints is None:
+            return 0.0
+        fixed = np.flatnonzero(~self._constraints.H[:, self.system.nx :].any(axis=1))
+        excess = program.values(guess)[1][fixed]  # those of stage 0 come first
+        if not (excess > 0).any():
+            return 0.0
+        size = program.slopes(guess).near[fixed]
+        worst = float(np.max(excess / np.where(size > 0, size, 1.0)))
+        return worst if worst > ON_LIMIT else 0.0
 
     def _packed(self, x0: np.ndarray, reference: Any, u_before: Any) -> tuple[Known, Any]:
         values = None
@@ -212,7 +257,10 @@ class NonlinearMPC(Controller):
         if self._path is None:
             return
         excess = np.asarray(self._path(reference.x, reference.u))
-        if not (excess <= FEASIBLE).all():
+        if (excess <= 0).all():
+            return
+        size = shooting.path_sizes(self._path, reference.x, reference.u)
+        if not (excess <= ON_LIMIT * size).all():
             raise ValueError(f"reference must satisfy path(x, u) ≤ 0, got {excess}")
 
     def _starts(self, program: Any, reference: Any, start: Any) -> list[np.ndarray]:
@@ -230,13 +278,7 @@ class NonlinearMPC(Controller):
             plans.append(np.concatenate([self._plan[1:], rest[None]]))
         guesses = [np.clip(U.ravel() / scale, program.lower, program.upper) for U in plans]
 
-        def merit(z: np.ndarray) -> float:
-            value, c = program.values(z)
-            total = value + 1e3 * (1 + abs(value)) * np.maximum(c, 0).sum()
-            return float(total) if np.isfinite(total) else np.inf
-
-        ranked = sorted(guesses, key=merit)
-        return ranked[:2] if len(ranked) > 1 else ranked
+        return _nlp.promising(program, guesses)[:2]
 
     def _program(self, layout: Known, flat: Any) -> _nlp.Program:
         scale = self._problem.scale
@@ -248,14 +290,17 @@ class NonlinearMPC(Controller):
             return float(f), np.asarray(c)
 
         @_nlp.remembered
-        def slopes(z: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            g, J = shooting.slopes(layout, flat, z)
-            return np.asarray(g), np.asarray(J)
+        def slopes(z: np.ndarray) -> shooting.Slopes:
+            return shooting.Slopes.of(*shooting.slopes(layout, flat, z))
 
-        def curvature(z: np.ndarray, multipliers: np.ndarray, factor: float) -> np.ndarray:
+        @_nlp.remembered
+        def curvature(z: np.ndarray, multipliers: np.ndarray, factor: Any) -> np.ndarray:
             return np.asarray(shooting.curvature(layout, flat, z, multipliers, factor))
 
-        return _nlp.Program(values, slopes, curvature, low / scale, high / scale, self._rows)
+        def bent(z: np.ndarray, multipliers: np.ndarray, factor: float) -> np.ndarray:
+            return curvature(z, multipliers, np.float64(factor))
+
+        return _nlp.Program(values, slopes, bent, low / scale, high / scale, self._rows)
 
     def _solution(
         self,
@@ -266,8 +311,8 @@ class NonlinearMPC(Controller):
         began: float,
     ) -> MPCSolution:
         N, nu = self.horizon, self.system.nu
-        good = tries[-1] if tries and tries[-1].good(FEASIBLE, self.tol) else None
-        best = good or min(tries, key=lambda t: (t.violation > FEASIBLE, t.residual), default=None)
+        good = tries[-1] if tries and tries[-1].good(self.tol) else None
+        best = good or min(tries, key=lambda t: (not t.feasible, t.residual), default=None)
         status, cost = "solved", np.nan
         U = np.full((N, nu), np.nan)
         X = np.full((N + 1, self.system.nx), np.nan)
@@ -278,11 +323,16 @@ class NonlinearMPC(Controller):
             f, x = shooting.along(*packed, U)
             cost, X = float(f), np.array(x)
             self._plan = U
+            if not (np.isfinite(cost) and np.isfinite(X).all()):  # σ need not see all states
+                status, message, good = "failed", "f returns NaN or infinity along the plan", None
+                U, X, cost = np.full_like(U, np.nan), np.full_like(X, np.nan), np.nan
         elif best is None:
-            status = "failed"
-        elif best.violation > FEASIBLE:
             status = "infeasible" if message.startswith("no input") else "failed"
-            message = message or f"the plan breaks the constraints by {best.violation:.2g}"
+        elif not best.feasible:
+            status = "infeasible" if message.startswith("no input") else "failed"
+            message = message or (
+                f"the plan breaks the constraints by {best.violation:.2g} of their size"
+            )
         else:
             status = "max_iterations" if best.limited else "failed"
             message = (
@@ -302,15 +352,6 @@ class NonlinearMPC(Controller):
             seconds=time.perf_counter() - began,
         )
         return with_reference(solution, reference)
-
-
-def _need_ipopt() -> None:
-    try:
-        import ipyopt  # noqa: F401
-    except ImportError as error:
-        raise ImportError(
-            'solver="ipopt" needs the package ipyopt: pip install "prefmpc[ipopt]"'
-        ) from error
 
 
 def _check_path(path: Callable[[Any, Any], Any], system: System) -> None:
