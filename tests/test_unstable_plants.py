@@ -1,4 +1,4 @@
-"""Batched MPC where condensing used to lose its digits: unstable plants, long horizons, any unit."""
+"""Batched MPC where condensing loses digits: unstable plants, long horizons, any unit."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from prefmpc import (
     oscillating_masses,
     simulate,
 )
+from prefmpc._pytree import bypass_init
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -34,9 +35,11 @@ def test_random_problems_have_the_inputs_of_a_sparse_solver(shape, plants, kind)
     assert found.sound
     assert max(found.differences) < 1e-6
     assert seen["solved", "solved"] > 0.4 * len(found.verdicts)
-    assert found.active > 0.2
+    assert found.active > 0.15
     for ours, theirs in seen:
-        assert ours == theirs or (ours == "failed" and theirs != "solved")
+        # Where no input holds the plant, neither knows what to say.
+        assert ours == theirs or theirs != "solved"
+        assert kind != "bounds" or ours != "infeasible"
 
 
 RADII = (1.1, 1.2, 1.5, 2.0)
@@ -65,7 +68,7 @@ def test_an_inverted_pendulum_with_saturated_force():
     B = [[0], [1.8182], [0], [4.5455]]
     cart = LinearSystem.from_continuous(A, B, dt=0.05, u_min=-10, u_max=10)
     sigma = QuadraticCost(np.diag([12, 1, 70, 1.5]), [[0.1]])
-    x0 = np.array([[0.3, 0, 0.1, 0.2], [-0.5, 0.2, -0.25, -0.4]])
+    x0 = np.array([[0.3, 0, 0.1, 0.2], [0.5, 0.2, 0.3, 0.9]])
     found = closed_loops(cart, sigma, x0, horizon=80, steps=60)
     expected = simulate(cart, LinearMPC(cart, sigma, 80), x0, 60)
     assert found.solved.all()
@@ -85,12 +88,10 @@ def test_plans_on_unstable_plants_lead_where_they_say():
 
 def test_the_slopes_of_a_loop_on_an_unstable_plant():
     plant = STACK[2]
-    x0 = np.array([0.1, -0.02])  # the first input is at its limit
+    x0 = np.array([0.35, 0.1])  # the first input is at its limit
 
     def total(R):
-        cost = QuadraticCost(PLAIN.Q, PLAIN.R)
-        cost = jax.tree.map(lambda leaf: leaf, cost)
-        object.__setattr__(cost, "theta_R", cost.theta_R * R)
+        cost = bypass_init(QuadraticCost, theta_Q=PLAIN.theta_Q, theta_R=PLAIN.theta_R * R)
         run = mpc_rollout(plant, cost, x0, horizon=60, steps=4)
         return (run.x**2).sum() + (run.u**2).sum()
 
@@ -111,7 +112,7 @@ def test_units_and_the_size_of_sigma_change_nothing(walls, growth):
     rng = np.random.default_rng(7)
     units = 10 ** rng.uniform(-9, 9, (12, 8))
     sigma, sizes = 10 ** rng.uniform(-9, 9, 12), 10.0 ** np.arange(-11, 1)
-    x0 = rng.uniform(-0.4, 0.4, (8, 6))
+    x0 = rng.uniform(-1.0, 1.0, (8, 6)) * 10 ** np.linspace(-2, 0.5, 8)[:, None]
     A = growth * MASSES.A
 
     def solved(s, c, size):
@@ -138,18 +139,23 @@ def test_units_and_the_size_of_sigma_change_nothing(walls, growth):
 
 def test_at_the_origin_nothing_moves():
     for limits in (None, Polyhedron(WALL, [0.3, 0.4])):
-        answer = BatchedMPC(MASSES, QuadraticCost(Q, R), 12, constraints=limits).solve(np.zeros(6))
-        assert (answer.status, answer.residual, answer.cost) == ("solved", 0, 0)
+        controller = BatchedMPC(MASSES, QuadraticCost(Q, R), 12, constraints=limits)
+        answer = controller.solve(np.zeros((8, 6)))
+        assert (answer.status == "solved").all()
+        np.testing.assert_array_equal(answer.residual, 0)
         np.testing.assert_array_equal(answer.trajectory.u, 0)
 
 
 def test_a_state_on_a_limit_keeps_to_it_and_one_beyond_it_does_not():
-    limits = Polyhedron(np.eye(8)[[3]], [0.3])
+    limits = Polyhedron(WALL, [0.3, 0.4])
     controller = BatchedMPC(MASSES, QuadraticCost(Q, R), 12, constraints=limits)
-    x0 = np.zeros((3, 6))
-    x0[:, 3] = 0.3 + np.array([0, 1e-7, 1e-5])
-    x0[:, 0] = -0.1
-    np.testing.assert_array_equal(controller.solve(x0).status, ["solved", "solved", "infeasible"])
+    x0 = np.zeros((8, 6))
+    x0[:, 3] = 0.3 + np.array([0, 1e-9, 1e-8, 1e-7, 1e-5, 1e-4, 1e-3, 1e-2])
+    x0[:, 0] = 0.2
+    expected = ["solved"] * 4 + ["infeasible"] * 4
+    np.testing.assert_array_equal(controller.solve(x0).status, expected)
+    single = LinearMPC(MASSES, QuadraticCost(Q, R), 12, constraints=limits)
+    assert [single.solve(x).status for x in x0] == expected
 
 
 def test_controllers_can_be_pickled_and_copied():
