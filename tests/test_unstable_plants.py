@@ -68,11 +68,11 @@ def test_an_inverted_pendulum_with_saturated_force():
     B = [[0], [1.8182], [0], [4.5455]]
     cart = LinearSystem.from_continuous(A, B, dt=0.05, u_min=-10, u_max=10)
     sigma = QuadraticCost(np.diag([12, 1, 70, 1.5]), [[0.1]])
-    x0 = np.array([[0.3, 0, 0.1, 0.2], [0.5, 0.2, 0.3, 0.9]])
+    x0 = np.array([[0.3, 0, 0.1, 0.2], [0.5, 0.2, 0.35, 1.5]])
     found = closed_loops(cart, sigma, x0, horizon=80, steps=60)
     expected = simulate(cart, LinearMPC(cart, sigma, 80), x0, 60)
     assert found.solved.all()
-    assert (np.abs(expected.u) == 10).any()
+    assert (np.abs(expected.u) > 10 - 1e-9).any()
     np.testing.assert_allclose(found.trajectories.u, expected.u, rtol=0, atol=1e-6)
 
 
