@@ -59,7 +59,7 @@ def point(size: Size, steps: int, repeats: int) -> dict[str, Any]:
     arguments = (*many, many.systems, begin, 1e-6)
     began: list[Any] = []
     compiling = seconds_of(
-        lambda: began.append(_program(size.N, steps, thorough=False).lower(*arguments).compile())
+        lambda: began.append(_program(size.N, steps).lower(*arguments).compile())
     )
     program = began[0]
     out = jax.tree.map(np.asarray, program(*arguments))

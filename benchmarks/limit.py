@@ -192,6 +192,6 @@ def run(mini: bool = False) -> dict[str, Any]:
     )
     once = compiled_flops(case)
     print(
-        f"  XLA counts {once / 1e6:.1f} Mflop with every loop's body once, interior point and all"
+        f"  XLA counts {once / 1e6:.1f} Mflop with every loop's body once, the dual method and all"
     )
     return {"rates": speed, "rows": rows, "xla_flops_bodies_once": once}

@@ -58,6 +58,10 @@ def test_random_programs_have_the_verdicts_of_clarabel(results):
     assert all(row["ours"] == row["Clarabel"] for row in found["rows"])
     assert found["finite"]
     assert found["largest_difference"] < 1e-6
+    found = results["solvers"]["mpc"]
+    assert found["share_solved"] == 1
+    assert found["sound"]
+    assert found["largest_difference"] < 1e-6
 
 
 def test_learners_of_one_problem_reach_one_minimum(results):

@@ -77,13 +77,16 @@ def test_an_inverted_pendulum_with_saturated_force():
 
 
 def test_plans_on_unstable_plants_lead_where_they_say():
-    answer = BatchedMPC(STACK, PLAIN, 100).solve(SMALL)
+    sizes = np.array([26.0, 19, 9, 4.5])  # the first inputs of the first three are at -1
+    answer = BatchedMPC(STACK, PLAIN, 100).solve((SMALL * sizes[:, None])[:, None])
     T = answer.trajectory
     assert (answer.status == "solved").all()
-    assert np.abs(T.x[:, -1]).max() < 1e-6
+    assert (np.abs(T.u[:3, 0, 0]) == 1).all()
+    assert np.abs(T.x[:, 0, -1]).max() < 1e-6
     for i in range(len(RADII)):
-        moved = STACK[i].step(T.x[i, :-1], T.u[i])
-        np.testing.assert_allclose(moved, T.x[i, 1:], rtol=0, atol=1e-15)
+        moved = STACK[i].step(T.x[i, 0, :-1], T.u[i, 0])
+        np.testing.assert_allclose(moved, T.x[i, 0, 1:], rtol=0, atol=1e-13)
+        assert answer.cost[i, 0] == pytest.approx(PLAIN(T[i, 0]), rel=1e-12)
 
 
 def test_the_slopes_of_a_loop_on_an_unstable_plant():

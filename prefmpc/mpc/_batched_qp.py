@@ -99,7 +99,10 @@ def solve(problem: CondensedProblem, x0: Any, tol: Any, *, start: Any = None) ->
     found, infeasible, limited = ended
     if problem.fixed is None:  # input bounds alone always leave a plan, however bad
         infeasible = dead & False
-    U = jnp.clip(found.rows, data.lower, data.upper)[..., :n] * problem.scale[:, None]
+    # What rounding leaves between an active row and its limit goes.
+    at_limit = jnp.where(found.multipliers > 0, data.upper, data.lower)
+    rows = jnp.where(found.multipliers != 0, at_limit, found.rows)
+    U = jnp.clip(rows, data.lower, data.upper)[..., :n] * problem.scale[:, None]
     status = jnp.where(found.done & jnp.isfinite(U).all(-1), SOLVED, FAILED)
     status = jnp.where(limited, UNFINISHED, status)
     status = jnp.where(impossible | infeasible, INFEASIBLE, status)
@@ -219,7 +222,10 @@ def _active_set(
 
     nowhere = jnp.zeros_like(data.free, dtype=bool)
     begin = (0, free, nowhere, dead | free.done, jnp.ones(dead.shape))
-    return jax.lax.while_loop(lambda carry: (carry[0] < STEPS) & ~jnp.all(carry[3]), step, begin)[1]
+    found: _Search = jax.lax.while_loop(
+        lambda carry: (carry[0] < STEPS) & ~jnp.all(carry[3]), step, begin
+    )[1]
+    return found._replace(w=-(found.multipliers @ problem.Y))
 
 
 def _kept(keep: Any, old: Any, new: Any) -> Any:

@@ -145,13 +145,15 @@ def _solve_many(
     answer = solve(problem, x0, tol)
     solved = (answer.status == SOLVED)[..., None]
     shape = (*x0.shape[:2], horizon, plant.nu)
+    low, high = plant.u_min[:, None], plant.u_max[:, None]
     U = jnp.where(solved, answer.U, jnp.nan).reshape(shape)
+    U = jnp.clip(U, low[:, None], high[:, None])
     assert problem.law is not None
 
     def step(x: Any, now: tuple[Any, Any, Any]) -> tuple[Any, tuple[Any, Any]]:
         # With feedback: on an unstable plant the inputs alone would not lead where they should.
         K, L, w = now
-        u = jnp.clip(w @ L - x @ K.swapaxes(1, 2), plant.u_min[:, None], plant.u_max[:, None])
+        u = jnp.clip(w @ L - x @ K.swapaxes(1, 2), low, high)
         return plant.step(x, u), (x, plant.output(x))
 
     start = jnp.where(solved, x0, jnp.nan)
