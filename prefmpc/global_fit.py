@@ -290,7 +290,9 @@ def _certificate(
     G = np.zeros((d, d))
     np.add.at(G, (rows, columns), half)
     np.add.at(G, (columns, rows), half)
-    shrink = (1 - 1e-12) * min(1.0, l2 / max(-float(np.linalg.eigvalsh(G)[0]), l2))
+    values = np.linalg.eigvalsh(G)
+    rounding = 1e-14 * float(np.abs(values).max())
+    shrink = (1 - 1e-9) * min(1.0, l2 / max(rounding - float(values[0]), l2))
     G = shrink * G + l2 * np.eye(d)
     p = data.labels + shrink * slope
     lowest_value = float(np.mean(scipy.special.entr(p) + scipy.special.entr(1 - p)))

@@ -211,14 +211,11 @@ def _program(horizon: int, steps: int, *, derivative: bool = False) -> Callable[
     def step_of(
         many: Controllers, problem: Any, plants: LinearSystem, tol: Any
     ) -> Callable[..., Any]:
-        limits = many.systems.u_min, many.systems.u_max
-
         def step(now: Any, _: None) -> Any:
             x, before, start = now
             answer = solve(problem, x, tol, start=start)
             U = with_derivative(problem, x, answer) if derivative else answer.U
-            u = jnp.clip(U[..., : plants.nu], *(bound[:, None] for bound in limits))
-            u = jnp.where((answer.status == SOLVED)[..., None], u, jnp.nan)
+            u = jnp.where((answer.status == SOLVED)[..., None], U[..., : plants.nu], jnp.nan)
             code = jnp.where(before == SOLVED, answer.status, before)
             x_next = plants.step(x, u)
             start = many.moved_on(answer.multipliers, horizon)

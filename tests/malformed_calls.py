@@ -122,7 +122,10 @@ def valid_calls():
         "settling_text": (p.settling_text, {"kappa": 2.0, "steps": 3}),
         "rollout": (
             p.rollout,
-            {"system": SYSTEM, "x0": np.ones((3, 2)), "law": np.ones((1, 2)), "steps": 2},
+            {
+                **{"system": SYSTEM, "x0": np.ones((3, 2)), "law": np.ones((1, 2))},
+                **{"steps": 2, "saturate": True},
+            },
         ),
         "random_weights": (
             p.random_weights,
@@ -137,6 +140,7 @@ def valid_calls():
             {
                 **{"system": SYSTEM, "size": 2, "steps": 2, "key": KEY, "radius": np.ones(2)},
                 **{"x0": None, "weights": (np.stack([np.eye(2)] * 2), np.ones((2, 1, 1)))},
+                "saturate": False,
             },
         ),
         "select": (p.select, {"trajectory": POOL, "signals": ["x", "du"]}),

@@ -99,10 +99,10 @@ def solve(problem: CondensedProblem, x0: Any, tol: Any, *, start: Any = None) ->
     found, infeasible, limited = ended
     if problem.fixed is None:  # input bounds alone always leave a plan, however bad
         infeasible = dead & False
-    # What rounding leaves between an active row and its limit goes.
-    at_limit = jnp.where(found.multipliers > 0, data.upper, data.lower)
-    rows = jnp.where(found.multipliers != 0, at_limit, found.rows)
-    U = jnp.clip(rows, data.lower, data.upper)[..., :n] * problem.scale[:, None]
+    low, high = problem.bounds[:, :1], problem.bounds[:, 1:]
+    pull = found.multipliers[..., :n]
+    U = jnp.clip(found.rows[..., :n] * problem.scale[:, None], low, high)
+    U = jnp.where(pull > 0, high, jnp.where(pull < 0, low, U))
     status = jnp.where(found.done & jnp.isfinite(U).all(-1), SOLVED, FAILED)
     status = jnp.where(limited, UNFINISHED, status)
     status = jnp.where(impossible | infeasible, INFEASIBLE, status)

@@ -63,6 +63,8 @@ class CondensedProblem(NamedTuple):
     lower: Any
     upper: Any
     scale: Any
+    bounds: Any
+    """Limits (2, n) of the inputs themselves: what is at a limit is there to the last digit."""
     order: Any
     """Which rows to look at first: with limits on the states, those of early stages. What cannot be
     kept on an unstable plant shows there, before everything grows beyond measure."""
@@ -225,5 +227,5 @@ def _normalised(
         fixed = fixed._replace(rows=still[n:], unit=length[n:])
     Y, E = Y / length[:, None], E / length[:, None]
     dual = Y @ Y.T if len(Y) <= 2 * n else None
-    limits = lower / length, upper / length
-    return CondensedProblem(Y, E, *limits, length[:n], order, dual, fixed, law)
+    limits, bounds = (lower / length, upper / length), jnp.stack([lower[:n], upper[:n]])
+    return CondensedProblem(Y, E, *limits, length[:n], bounds, order, dual, fixed, law)

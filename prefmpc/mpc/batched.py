@@ -147,7 +147,6 @@ def _solve_many(
     shape = (*x0.shape[:2], horizon, plant.nu)
     low, high = plant.u_min[:, None], plant.u_max[:, None]
     U = jnp.where(solved, answer.U, jnp.nan).reshape(shape)
-    U = jnp.clip(U, low[:, None], high[:, None])
     assert problem.law is not None
 
     def step(x: Any, now: tuple[Any, Any, Any]) -> tuple[Any, tuple[Any, Any]]:
