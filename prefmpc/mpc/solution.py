@@ -42,11 +42,12 @@ class MPCSolution:
         A sentence that says what the status means here.
     iterations : int, or int array (...)
     residual : float, or array (...)
-        How far from optimal: for `LinearMPC` and `ConvexMPC` the largest violation of the
-        optimality conditions relative to the sizes of their terms (of "infeasible": what the
-        proof lacks), for `BatchedMPC` a proven bound on the distance of the inputs from the
-        optimal ones, for `NonlinearMPC` the part of ∇σ that no active constraint balances,
-        relative to 1 + ‖∇σ‖∞.
+        How far from optimal, computed from the plan whatever the solver says of itself: for
+        `LinearMPC` and `ConvexMPC` the largest violation of the optimality conditions relative to
+        the sizes of their terms (of "infeasible": what the proof lacks); for `BatchedMPC` the
+        largest error of an input relative to the largest input of the plan, estimated; for
+        `NonlinearMPC` the part of ∇σ that no active constraint balances, relative to the sizes
+        of its terms.
     seconds : float
         Wall time of the solve.
     """
