@@ -61,7 +61,6 @@ def real_array(name: str, value: Any, *, booleans: bool = False) -> Any:
     NumPy alone would read "1" and b"1" as numbers, forget masks and take None for NaN.
     ``booleans``: take True for 1 and False for 0. NumPy stays NumPy, JAX stays JAX.
     """
-    require_x64()
     kinds = "fiub" if booleans else "fiu"
     if isinstance(value, jax.Array):
         plain = not jnp.issubdtype(value.dtype, jax.dtypes.extended)
@@ -100,6 +99,7 @@ def finite_array(
     ``ndim`` is the exact number of dimensions wanted (None: any). For ``booleans`` and the kind
     of array see `real_array`. Tracers pass through: only their shape can be checked.
     """
+    require_x64()
     array = real_array(name, value, booleans=booleans)
     if ndim is not None and array.ndim != ndim:
         raise ValueError(f"{name} must have {ndim} dimension(s), got shape {array.shape}")
