@@ -44,9 +44,9 @@ class MPCSolution:
     residual : float, or array (...)
         How far from optimal: for `LinearMPC` and `ConvexMPC` the largest violation of the
         optimality conditions relative to the sizes of their terms (of "infeasible": what the
-        proof lacks), for `BatchedMPC` a proven bound on the distance of the inputs from the
-        optimal ones, for `NonlinearMPC` the part of ∇σ that no active constraint balances,
-        relative to 1 + ‖∇σ‖∞.
+        proof lacks), for `BatchedMPC` an estimate of the largest error of an input, relative to
+        the largest input of the plan, for `NonlinearMPC` the part of ∇σ that no active
+        constraint balances, relative to 1 + ‖∇σ‖∞.
     seconds : float
         Wall time of the solve.
     """
