@@ -34,7 +34,7 @@ help:
 # The list is complete, so nothing has to be resolved; modules compile when first used.
 # The last line but one builds matplotlib's font cache, which would else write a message
 # into the first notebook that draws.
-$(STAMP): requirements.txt pyproject.toml
+$(STAMP): requirements.txt pyproject.toml book/pyproject.toml
 	@if [ -z "$(PYTHON)" ] || ! "$(PYTHON)" -c '$(RECENT)' >/dev/null 2>&1; then \
 		echo "error: Python 3.11 or later was not found; name it: make PYTHON=/path/to/python" >&2; \
 		exit 1; \
@@ -43,7 +43,7 @@ $(STAMP): requirements.txt pyproject.toml
 	@rm -f $(STAMP) $(LAB_STAMP)
 	@[ -x $(BIN)/python ] || "$(PYTHON)" -m venv $(VENV)
 	@$(BIN)/python -m pip install --quiet --no-deps --no-compile -r requirements.txt
-	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e .
+	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e . -e book
 	@$(BIN)/python -m pip check --quiet
 	@$(BIN)/python -c 'import matplotlib.font_manager' 2>/dev/null
 	@touch $(STAMP)

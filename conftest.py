@@ -16,7 +16,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # the matrices are small: threads only wait
 os.environ["SOURCE_DATE_EPOCH"] = "0"
 os.environ["PYTHONPATH"] = os.pathsep.join(
-    [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+    [str(ROOT), str(ROOT / "book"), *filter(None, [os.environ.get("PYTHONPATH")])]
 )
 # The same programs are compiled in many tests and notebooks: keep them between processes, in a
 # folder for each set of XLA's options. Only a cache of limited size is locked while it is read or

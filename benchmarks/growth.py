@@ -18,8 +18,8 @@ import peers
 from measure import median, seconds_of, show, slope
 
 from prefmpc import QuadraticCost, oscillating_masses, random_states
-from prefmpc.loops import _program
 from prefmpc.mpc.batched import controllers, starts
+from prefmpc.mpc.loops import _program
 
 STEPS = 30
 CHECKED = 2

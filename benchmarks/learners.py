@@ -19,7 +19,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import minimize
 
 import prefmpc
-from prefmpc import training
+from prefmpc.learning import training
 
 LOWER = 1e-6
 """Least diagonal entry of a Cholesky factor, relative to the prior's: W stays definite."""

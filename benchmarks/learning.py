@@ -19,7 +19,7 @@ import numpy as np
 from measure import child, median, seconds_of, show
 
 import prefmpc
-from prefmpc import studies
+import studies
 
 PRIOR = ([*studies.RADIUS], [1.0, 1.0])
 SIZES = (20, 1000, 10_000, 100_000, 1_000_000)

@@ -31,9 +31,9 @@ from loops import HORIZON, MINI, Case, Sizes
 from measure import median, show
 
 import prefmpc
-from prefmpc import _newton, convex
-from prefmpc.loops import _program
+from prefmpc.learning import _newton, convex
 from prefmpc.mpc.batched import controllers, starts
+from prefmpc.mpc.loops import _program
 
 SMALL = (200, 20)
 LOOPED = 2000

@@ -27,7 +27,7 @@ from prefmpc import (
     random_states,
     simulate,
 )
-from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
+from studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
 HORIZON = 10
 OURS = ("closed_loops, tol 1e-6", "closed_loops, tol 1e-8")

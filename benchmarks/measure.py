@@ -66,7 +66,12 @@ def child(code: str, *arguments: Any) -> Any:
     """
     keep = {k: v for k, v in os.environ.items() if not k.startswith("JAX_COMPILATION_CACHE")}
     here = Path(__file__).resolve().parent
-    path = [str(here), str(here.parent), *filter(None, [keep.get("PYTHONPATH")])]
+    path = [
+        str(here),
+        str(here.parent),
+        str(here.parent / "book"),
+        *filter(None, [keep.get("PYTHONPATH")]),
+    ]
     done = subprocess.run(
         [sys.executable, "-W", "ignore", "-c", code, *map(str, arguments)],
         check=True,

@@ -16,6 +16,7 @@ from pathlib import Path
 
 # The library of this checkout, whatever is installed; small matrices, for which threads only wait.
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(1, str(Path(__file__).resolve().parents[1] / "book"))
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 

@@ -32,7 +32,7 @@ from prefmpc import (
     random_states,
 )
 from prefmpc.mpc._batched_qp import STATUSES
-from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
+from studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 from random_mpc import KINDS, SHAPES, compared, random_problems

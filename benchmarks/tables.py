@@ -18,7 +18,7 @@ import json, time
 began = time.perf_counter()
 import jax
 jax.config.update("jax_enable_x64", True)
-from prefmpc import studies
+import studies
 imported = time.perf_counter() - began
 compiling = []
 def listen(event, seconds, **_):
@@ -64,7 +64,8 @@ SIZES = """
 import json, jax
 jax.config.update("jax_enable_x64", True)
 import prefmpc
-from prefmpc import studies, training
+from prefmpc.learning import training
+import studies
 _, _, train, _ = studies.quadratic_data(key=jax.random.key(0))
 for n in studies.SIZES:
     prefmpc.fit(train[n], key=jax.random.key(0), selection="training_loss", restarts=2)

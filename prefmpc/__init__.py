@@ -5,17 +5,41 @@ choices, through P(T_i is preferred to T_j) = 1 / (1 + exp(σ(T_i) − σ(T_j)))
 objective of the controller.
 """
 
-from prefmpc.comparisons import Comparisons
-from prefmpc.convex import Interval, MapResult, fit_map, fit_maps
-from prefmpc.early_stopping import NetworkFit, fit_network
 from prefmpc.evaluation import WinRate, accuracy, regret, simulate, win_rate
-from prefmpc.global_fit import GlobalResult, fit_global
-from prefmpc.loops import ClosedLoops, closed_loops, mpc_rollout
-from prefmpc.losses import FitError
-from prefmpc.mlp import MLPCost
-from prefmpc.models import CostModel, QuadraticCost, SumCost
+from prefmpc.learning import (
+    FitError,
+    FitResult,
+    GlobalResult,
+    Interval,
+    MapResult,
+    NetworkFit,
+    Posterior,
+    PriorChoice,
+    WishartPrior,
+    blocks,
+    bryson,
+    choose_prior,
+    fit,
+    fit_global,
+    fit_map,
+    fit_maps,
+    fit_network,
+    posterior,
+)
+from prefmpc.models import (
+    CostModel,
+    ICNNCost,
+    MLPCost,
+    QuadraticCost,
+    SeparableCost,
+    SignalCost,
+    SumCost,
+    select,
+    soft_constraints,
+)
 from prefmpc.mpc import (
     BatchedMPC,
+    ClosedLoops,
     ConvexMPC,
     LinearMPC,
     MPCError,
@@ -26,42 +50,44 @@ from prefmpc.mpc import (
     SteadyState,
     TerminalIngredients,
     check_stability,
+    closed_loops,
+    mpc_rollout,
     steady_state,
     terminal_ingredients,
 )
-from prefmpc.networks import ICNNCost, soft_constraints
-from prefmpc.nonlinear import NonlinearSystem
-from prefmpc.plants import cart_pendulum, kinematic_bicycle
-from prefmpc.pools import lqr_pool, random_states, random_weights
 from prefmpc.preferences import (
+    Comparisons,
     Criterion,
+    Moments,
     Preference,
     QuadraticPreference,
     SettlingTimePreference,
+    Trajectory,
     by_criterion,
     erring,
     lexicographic,
     logistic,
-    one_by_one,
-)
-from prefmpc.priors import WishartPrior, blocks, bryson
-from prefmpc.selection import PriorChoice, choose_prior
-from prefmpc.separable import SeparableCost
-from prefmpc.sets import Ellipsoid, Polyhedron, SecondOrderCone
-from prefmpc.signals import SignalCost, select
-from prefmpc.systems import LinearSystem, oscillating_masses
-from prefmpc.training import FitResult, fit
-from prefmpc.trajectories import (
-    Moments,
-    Trajectory,
+    lqr_pool,
     max_input,
+    one_by_one,
     phi,
+    random_states,
+    random_weights,
     rollout,
     second_moments,
     settling_text,
     settling_time,
 )
-from prefmpc.uncertainty import Posterior, posterior
+from prefmpc.systems import (
+    Ellipsoid,
+    LinearSystem,
+    NonlinearSystem,
+    Polyhedron,
+    SecondOrderCone,
+    cart_pendulum,
+    kinematic_bicycle,
+    oscillating_masses,
+)
 
 __version__ = "0.1.0"
 

@@ -11,11 +11,11 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from prefmpc._checks import function, instance, positive_int, real_array, share, single
-from prefmpc.comparisons import Comparisons
 from prefmpc.mpc.solution import Controller, check_state
-from prefmpc.preferences import Preference, asked, failed_loses
-from prefmpc.systems import System
-from prefmpc.trajectories import Trajectory, failed, from_flat
+from prefmpc.preferences.comparisons import Comparisons
+from prefmpc.preferences.people import Preference, asked, failed_loses
+from prefmpc.preferences.trajectories import Trajectory, failed, from_flat
+from prefmpc.systems.linear import System
 
 SAME_START = 1e-9
 """So far apart two states may be to count as the same, relative to the largest on the way."""

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import settings
 
 from prefmpc import LinearSystem, oscillating_masses
-from prefmpc.studies import quadratic_data
+from studies import quadratic_data
 
 # The same examples on every run; no deadline, since a first call may compile.
 settings.register_profile("prefmpc", derandomize=True, deadline=None, max_examples=25)

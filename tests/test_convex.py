@@ -31,7 +31,7 @@ from prefmpc import (
     second_moments,
     selection,
 )
-from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
+from studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
 POOL = lqr_pool(
     oscillating_masses(), 30, 10, key=jax.random.key(2000), radius=RADIUS, saturate=False

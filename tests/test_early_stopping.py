@@ -19,9 +19,9 @@ from prefmpc import (
     lqr_pool,
     oscillating_masses,
 )
-from prefmpc.early_stopping import _batches, _part
-from prefmpc.losses import cross_entropy, padded_size, pair_data
-from prefmpc.studies import RADIUS
+from prefmpc.learning.early_stopping import _batches, _part
+from prefmpc.learning.losses import cross_entropy, padded_size, pair_data
+from studies import RADIUS
 
 KEY = jax.random.key(3000)
 MASSES = oscillating_masses()

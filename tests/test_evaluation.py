@@ -30,7 +30,7 @@ from prefmpc import (
     win_rate,
 )
 from prefmpc._pytree import bypass_init
-from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
+from studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
 KEY = jax.random.key(2000)
 MASSES = oscillating_masses()

@@ -19,9 +19,9 @@ from prefmpc import (
     terminal_ingredients,
 )
 from prefmpc._random import generator
-from prefmpc.studies import RADIUS, read_spread
-from prefmpc.studies.__main__ import BOOK
-from prefmpc.studies.onesided import (
+from studies import RADIUS, read_spread
+from studies.__main__ import BOOK
+from studies.onesided import (
     CONTROLLERS,
     FORCES,
     LEARNERS,
@@ -34,7 +34,7 @@ from prefmpc.studies.onesided import (
     person_loops,
     with_constant,
 )
-from prefmpc.studies.stability import (
+from studies.stability import (
     CHECKS,
     HORIZONS,
     PLANTS,

@@ -10,8 +10,8 @@ import pytest
 from scipy.optimize import minimize
 
 from prefmpc import Comparisons, FitError, QuadraticCost, fit_global
-from prefmpc.losses import objective, pair_data
-from prefmpc.studies import quadratic_data, settling_data
+from prefmpc.learning.losses import objective, pair_data
+from studies import quadratic_data, settling_data
 
 STARTS = QuadraticCost.random(6, 2, key=jax.random.key(2300), shape=(2,))
 TREE = jax.tree.structure(STARTS[0])
@@ -74,7 +74,7 @@ def test_clarabel_agrees():
 
 
 def test_a_model_that_was_not_found_is_not_handed_out(monkeypatch):
-    import prefmpc.global_fit as module
+    import prefmpc.learning.global_fit as module
 
     monkeypatch.setattr(module, "GAP", 0.0)
     with pytest.warns(RuntimeWarning, match="max_iterations"):
@@ -86,7 +86,7 @@ def test_a_model_that_was_not_found_is_not_handed_out(monkeypatch):
 @pytest.mark.parametrize("bad", [1.0, np.nan, np.inf])
 @pytest.mark.parametrize("solver", ["barrier", "clarabel"])
 def test_only_a_small_finite_gap_is_a_minimum(monkeypatch, solver, bad):
-    module = sys.modules["prefmpc.global_fit"]
+    module = sys.modules["prefmpc.learning.global_fit"]
     name = "_follow" if solver == "barrier" else "_certificate"
     true = getattr(module, name)
 

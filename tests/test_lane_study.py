@@ -10,7 +10,7 @@ import pytest
 
 from prefmpc import MPCError, Trajectory, accuracy
 from prefmpc._random import generator
-from prefmpc.studies import lane, read_spread
+from studies import lane, read_spread
 
 FILE = Path(__file__).parents[1] / "book" / "extensions" / "lane_spread.json"
 

@@ -28,7 +28,7 @@ from prefmpc import (
     simulate,
     terminal_ingredients,
 )
-from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
+from studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
 KEY = jax.random.key(2000)
 MASSES = oscillating_masses()
@@ -175,7 +175,7 @@ if len(sys.argv) > 1:
     jax.distributed.initialize(f"127.0.0.1:{sys.argv[1]}", 2, int(sys.argv[2]))
 jax.config.update("jax_enable_x64", True)
 import prefmpc as p
-from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
+from studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 system, cost = p.oscillating_masses(), p.QuadraticCost(QUADRATIC_Q, QUADRATIC_R)
 mesh = jax.make_mesh((jax.device_count(),), ("devices",))
 assert mesh.size == COUNT, mesh

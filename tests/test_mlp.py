@@ -16,7 +16,7 @@ from prefmpc import (
     Trajectory,
     by_criterion,
 )
-from prefmpc.losses import cross_entropy, pair_data
+from prefmpc.learning.losses import cross_entropy, pair_data
 
 KEY = jax.random.key(2800)
 RNG = np.random.default_rng(0)

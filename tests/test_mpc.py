@@ -21,7 +21,7 @@ from prefmpc import (
     random_states,
 )
 from prefmpc.mpc import _batched_qp, _cone, _dual_method, qp
-from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
+from studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
 KEY = jax.random.key(2000)
 MASSES = oscillating_masses()

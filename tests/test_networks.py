@@ -25,8 +25,8 @@ from prefmpc import (
     oscillating_masses,
     soft_constraints,
 )
-from prefmpc.losses import cross_entropy, pair_data
-from prefmpc.studies import RADIUS
+from prefmpc.learning.losses import cross_entropy, pair_data
+from studies import RADIUS
 
 RNG = np.random.default_rng(0)
 SCALE = np.array([2.0, 0.5, 1.0])  # two states, one input

@@ -18,7 +18,7 @@ from prefmpc import (
     rollout,
     simulate,
 )
-from prefmpc.plants import GRAVITY
+from prefmpc.systems.plants import GRAVITY
 
 CAR, PENDULUM = kinematic_bicycle(), cart_pendulum()
 RNG = np.random.default_rng(0)

@@ -35,7 +35,7 @@ from prefmpc import (
     terminal_ingredients,
 )
 from prefmpc.mpc import _nlp
-from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
+from studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
 KEY = jax.random.key(2700)
 MASSES = oscillating_masses()

@@ -9,6 +9,7 @@ import os
 import pkgutil
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -104,84 +105,22 @@ def test_everything_public_has_a_docstring(name):
                     assert body.__doc__, f"{label}.{method}"
 
 
-# What each module may import of prefmpc: arrows point one way. See ARCHITECTURE.md.
-HELPERS = {"_checks", "_pytree", "_random"}
-LAYERS = {
-    "_checks": set(),
-    "_files": set(),
-    "_pytree": set(),
-    "_random": {"_checks"},
-    "_lbfgsb": set(),
-    "_units": set(),
-    "systems": HELPERS | {"_units"},
-    "sets": HELPERS,
-    "trajectories": HELPERS | {"systems"},
-    "pools": HELPERS | {"systems", "trajectories"},
-    "preferences": HELPERS | {"trajectories"},
-    "comparisons": HELPERS | {"_files", "trajectories", "preferences"},
-    "models": HELPERS | {"systems", "sets", "trajectories", "pools"},
-    "losses": HELPERS | {"trajectories", "comparisons"},
-    "training": HELPERS | {"_lbfgsb", "trajectories", "models", "comparisons", "losses"},
-    "priors": HELPERS,
-    "_newton": HELPERS | {"_sharding", "trajectories", "comparisons", "models", "priors"},
-    "_chart": HELPERS | {"_newton"},
-    "uncertainty": {
-        *HELPERS,
-        *("_newton", "_chart", "trajectories", "comparisons", "models", "convex"),
-    },
-    "selection": HELPERS | {"_newton", "_chart", "comparisons", "convex", "losses", "priors"},
-    "global_fit": HELPERS | {"_newton", "comparisons", "models", "losses"},
-    "convex": {
-        *HELPERS,
-        *("_newton", "_sharding", "trajectories", "comparisons", "models", "losses", "priors"),
-    },
-    "_network": HELPERS | {"trajectories"},
-    "networks": HELPERS | {"_network", "sets"},
-    "mlp": HELPERS | {"_network"},
-    "separable": HELPERS | {"trajectories"},
-    "signals": HELPERS | {"trajectories", "models"},
-    "nonlinear": HELPERS | {"systems"},
-    "plants": HELPERS | {"nonlinear"},
-    "early_stopping": HELPERS | {"trajectories", "models", "comparisons", "losses", "training"},
-    "mpc": {
-        *HELPERS,
-        *("_units", "systems", "nonlinear", "sets", "trajectories", "models", "networks", "mpc"),
-    },
-    "_sharding": HELPERS,
-    "loops": {
-        *HELPERS,
-        *("_sharding", "systems", "sets", "trajectories", "models", "mpc"),
-    },
-    "evaluation": {
-        *HELPERS,
-        *("systems", "trajectories", "preferences", "comparisons", "models", "mpc"),
-    },
-    "studies": {
-        *HELPERS,
-        "_files",
-        *("systems", "sets", "trajectories", "pools", "preferences", "comparisons", "models"),
-        *(
-            "networks",
-            "mlp",
-            "separable",
-            "signals",
-            "nonlinear",
-            "plants",
-            "early_stopping",
-            "training",
-        ),
-        *("priors", "convex", "uncertainty", "selection"),
-        *("mpc", "evaluation", "loops", "studies"),
-    },
-    "plots": {"_checks"},
+# What each room may import of the others: arrows point one way. Small helpers and what serves all
+# stand at the top.
+ROOMS = {
+    "systems": set(),
+    "preferences": {"systems"},
+    "models": {"systems", "preferences"},
+    "learning": {"preferences", "models"},
+    "mpc": {"systems", "preferences", "models"},
+    "evaluation": {"systems", "preferences", "models", "mpc"},
+    "plots": set(),
 }
+HELPERS = {path.stem for path in ROOT.glob("_*.py")} - {"__init__"}
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda path: path.name)
-def test_imports_follow_the_layers(path):
-    module = path.relative_to(ROOT).parts[0].removesuffix(".py")
-    if module == "__init__":
-        return
+def imported(path):
+    """Return the modules of prefmpc that a file imports, as tuples."""
     used = set()
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.ImportFrom):
@@ -191,9 +130,28 @@ def test_imports_follow_the_layers(path):
             names = [alias.name for alias in node.names]
         else:
             continue
-        used |= {n.split(".")[1] for n in names if n.startswith("prefmpc.")}
         assert "prefmpc" not in names, f"{path.name} imports the whole package"
-    assert used <= LAYERS[module]
+        assert "studies" not in {n.split(".")[0] for n in names}, "the book is not the library's"
+        used |= {tuple(n.split(".")[1:]) for n in names if n.startswith("prefmpc.")}
+    return used
+
+
+@pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda path: path.name)
+def test_imports_follow_the_rooms(path):
+    room = path.relative_to(ROOT).parts[0].removesuffix(".py")
+    if room == "__init__":
+        return
+    used = {names[0] for names in imported(path)} - HELPERS
+    assert used <= (set() if room in HELPERS else ROOMS[room] | {room})
+
+
+def test_no_module_depends_on_itself():
+    files = {path.relative_to(ROOT).with_suffix("").parts: path for path in ROOT.rglob("*.py")}
+    graph = {}
+    for names, path in files.items():
+        if names[-1] != "__init__":
+            graph[names] = {used for used in imported(path) if used in files}
+    tuple(TopologicalSorter(graph).static_order())
 
 
 # These are made by the library, or hold no input of their own.

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from prefmpc import Comparisons, QuadraticCost, accuracy, lqr_pool, oscillating_masses
-from prefmpc.studies import RADIUS, SIZES, read_spread
-from prefmpc.studies.__main__ import BOOK
-from prefmpc.studies.priors import (
+from studies import RADIUS, SIZES, read_spread
+from studies.__main__ import BOOK
+from studies.priors import (
     ASKED,
     COUPLED_Q,
     LEARNERS,

@@ -18,9 +18,9 @@ from prefmpc import (
     simulate,
     steady_state,
 )
-from prefmpc.studies import RADIUS, read_spread
-from prefmpc.studies import references as study
-from prefmpc.studies.__main__ import BOOK
+from studies import RADIUS, read_spread
+from studies import references as study
+from studies.__main__ import BOOK
 
 SPREAD = read_spread(BOOK / "extensions" / "references_spread.json")
 MASSES = oscillating_masses()

@@ -38,7 +38,7 @@ from prefmpc import (
     posterior,
 )
 from prefmpc.mpc import _nlp
-from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
+from studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
 POOL = lqr_pool(oscillating_masses(), 30, 10, key=jax.random.key(5100), radius=RADIUS)
 PERSON = erring(QuadraticPreference(QUADRATIC_Q, QUADRATIC_R), 0.2)

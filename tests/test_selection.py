@@ -16,7 +16,7 @@ from prefmpc import (
     lqr_pool,
     oscillating_masses,
 )
-from prefmpc.studies import RADIUS
+from studies import RADIUS
 
 POOL = lqr_pool(
     oscillating_masses(), 30, 10, key=jax.random.key(2200), radius=RADIUS, saturate=False

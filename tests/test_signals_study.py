@@ -17,9 +17,9 @@ from prefmpc import (
     simulate,
 )
 from prefmpc._random import generator
-from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R, RADIUS, read_spread
-from prefmpc.studies.__main__ import BOOK
-from prefmpc.studies.signals import (
+from studies import QUADRATIC_Q, QUADRATIC_R, RADIUS, read_spread
+from studies.__main__ import BOOK
+from studies.signals import (
     CASES,
     JERK_LEARNERS,
     JERK_SIZES,
@@ -103,7 +103,7 @@ def test_the_plant_s_prior_is_bryson_s_rule_in_other_words():
 
 
 def test_the_plant_that_is_left_alone():
-    from prefmpc.studies.signals import left_alone
+    from studies.signals import left_alone
 
     x0 = random_states(RADIUS, key=jax.random.key(3005), shape=(2,))
     run = simulate(MASSES, lambda x: np.zeros(2), x0, 4)

@@ -20,7 +20,8 @@ from prefmpc import (
     phi,
     settling_time,
 )
-from prefmpc.studies import (
+from prefmpc.learning.training import best_restart
+from studies import (
     COLUMNS,
     PAPER_TABLE_I,
     PAPER_TABLE_II,
@@ -48,10 +49,9 @@ from prefmpc.studies import (
     ties_case,
     write_spread,
 )
-from prefmpc.studies import measures as measuring
-from prefmpc.studies.quadratic import DISTINCT_COLUMNS, DISTINCT_ROWS
-from prefmpc.studies.settling import TIES_COLUMNS, TIES_ROWS, coarse_preference
-from prefmpc.training import best_restart
+from studies import measures as measuring
+from studies.quadratic import DISTINCT_COLUMNS, DISTINCT_ROWS
+from studies.settling import TIES_COLUMNS, TIES_ROWS, coarse_preference
 
 BOOK = Path(__file__).parents[1] / "book"
 SPREAD = BOOK / "case_studies" / "quadratic_spread.json"
@@ -399,7 +399,7 @@ def test_the_command_line_writes_the_draws_of_the_first_seeds(tmp_path, monkeypa
 
     monkeypatch.setitem(__main__.STUDIES, "quadratic", (study, "new/spread.json", {"rows": ["a"]}))
     monkeypatch.setattr(__main__, "BOOK", tmp_path)
-    monkeypatch.setattr(sys, "argv", ["prefmpc.studies", "quadratic", "--draws", "3"])
+    monkeypatch.setattr(sys, "argv", ["studies", "quadratic", "--draws", "3"])
     __main__.main()
     path = tmp_path / "new" / "spread.json"
     np.testing.assert_array_equal(read_spread(path)["table"], [[0, 0], [0, 1], [0, 2]])

@@ -25,7 +25,7 @@ from prefmpc import (
     steady_state,
     terminal_ingredients,
 )
-from prefmpc.studies import QUADRATIC_Q, QUADRATIC_R
+from studies import QUADRATIC_Q, QUADRATIC_R
 
 MASSES = oscillating_masses()
 PAPER = QuadraticCost(QUADRATIC_Q, QUADRATIC_R)

@@ -24,11 +24,11 @@ from prefmpc import (
     fit,
     training,
 )
-from prefmpc._lbfgsb import minimise
 from prefmpc._pytree import register_pytree
-from prefmpc.losses import PairData, cross_entropy, logits, objective, pair_data
-from prefmpc.studies import error_rates
-from prefmpc.training import best_restart
+from prefmpc.learning._lbfgsb import minimise
+from prefmpc.learning.losses import PairData, cross_entropy, logits, objective, pair_data
+from prefmpc.learning.training import best_restart
+from studies import error_rates
 
 KEY = jax.random.key(2000)
 RNG = np.random.default_rng(0)

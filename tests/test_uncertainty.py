@@ -27,9 +27,9 @@ from prefmpc import (
     oscillating_masses,
     posterior,
 )
-from prefmpc._chart import Chart, laplaces
-from prefmpc.studies import RADIUS
-from prefmpc.uncertainty import Posterior, effective_draws
+from prefmpc.learning._chart import Chart, laplaces
+from prefmpc.learning.uncertainty import Posterior, effective_draws
+from studies import RADIUS
 
 POOL = lqr_pool(
     oscillating_masses(), 30, 10, key=jax.random.key(2100), radius=RADIUS, saturate=False

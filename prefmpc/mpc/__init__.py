@@ -2,6 +2,7 @@
 
 from prefmpc.mpc.batched import BatchedMPC
 from prefmpc.mpc.convex import ConvexMPC
+from prefmpc.mpc.loops import ClosedLoops, closed_loops, mpc_rollout
 from prefmpc.mpc.nonlinear import NonlinearMPC
 from prefmpc.mpc.qp import LinearMPC
 from prefmpc.mpc.solution import MPCError, MPCSolution
@@ -12,6 +13,7 @@ from prefmpc.mpc.tracking import ReferenceTracker
 
 __all__ = [
     "BatchedMPC",
+    "ClosedLoops",
     "ConvexMPC",
     "LinearMPC",
     "MPCError",
@@ -22,6 +24,8 @@ __all__ = [
     "SteadyState",
     "TerminalIngredients",
     "check_stability",
+    "closed_loops",
+    "mpc_rollout",
     "steady_state",
     "terminal_ingredients",
 ]

@@ -14,9 +14,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from prefmpc.models import QuadraticCost
+from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.mpc._limits import MOVES, input_size
-from prefmpc.systems import LinearSystem
+from prefmpc.systems.linear import LinearSystem
 
 
 class Sets(NamedTuple):

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from prefmpc._checks import instance, nonnegative, sequence
-from prefmpc.models import QuadraticCost, SumCost
+from prefmpc.models.networks import ICNNCost
+from prefmpc.models.quadratic import QuadraticCost, SumCost
 from prefmpc.mpc.solution import check_dimension
 from prefmpc.mpc.terminal import stage_constraints
-from prefmpc.networks import ICNNCost
-from prefmpc.sets import Polyhedron, SecondOrderCone
-from prefmpc.systems import LinearSystem
+from prefmpc.systems.linear import LinearSystem
+from prefmpc.systems.sets import Polyhedron, SecondOrderCone
 
 
 def check_convex(cost: Any, nx: int, nu: int, horizon: int) -> None:

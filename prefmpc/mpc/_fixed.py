@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from prefmpc.mpc._limits import ON_LIMIT, input_size, row_sizes, unmoved
-from prefmpc.sets import Polyhedron, SecondOrderCone
-from prefmpc.systems import LinearSystem
+from prefmpc.systems.linear import LinearSystem
+from prefmpc.systems.sets import Polyhedron, SecondOrderCone
 
 
 class FixedRows:

@@ -17,8 +17,8 @@ import numpy as np
 
 from prefmpc._pytree import bypass_init
 from prefmpc.mpc._limits import input_size
-from prefmpc.systems import System
-from prefmpc.trajectories import Trajectory
+from prefmpc.preferences.trajectories import Trajectory
+from prefmpc.systems.linear import System
 
 ROUNDING = 1e-10
 """Of σ's slopes, what they would be without a reference: less is lost in its digits."""

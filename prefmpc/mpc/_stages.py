@@ -12,8 +12,8 @@ from prefmpc._units import cost_units, free_response, matters, power_of_two
 from prefmpc.mpc._expressions import per_unit
 from prefmpc.mpc._fixed import FixedRows
 from prefmpc.mpc.steady import SteadyState
-from prefmpc.sets import Polyhedron
-from prefmpc.systems import LinearSystem
+from prefmpc.systems.linear import LinearSystem
+from prefmpc.systems.sets import Polyhedron
 
 FLOOR = 1e-3
 """Residuals are relative to the sizes of their terms, but to no smaller share of the unit."""

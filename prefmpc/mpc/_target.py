@@ -9,7 +9,7 @@ import numpy as np
 
 from prefmpc._units import completed_units
 from prefmpc.mpc._cone import TIGHT, ConeProgram
-from prefmpc.sets import Polyhedron
+from prefmpc.systems.sets import Polyhedron
 
 EXACT = 1e-12
 CONSISTENT = 1e-9

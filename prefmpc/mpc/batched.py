@@ -15,7 +15,7 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import array_module, nonnegative, positive_int
 from prefmpc._pytree import bypass_init
-from prefmpc.models import QuadraticCost
+from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.mpc._batched_qp import SOLVED, STATUSES, Answer, solve
 from prefmpc.mpc._condensed import CondensedProblem, Sets, condense
 from prefmpc.mpc.solution import (
@@ -25,9 +25,9 @@ from prefmpc.mpc.solution import (
     check_state,
 )
 from prefmpc.mpc.terminal import TerminalIngredients, check_polyhedron, terminal_set
-from prefmpc.sets import Polyhedron
-from prefmpc.systems import LinearSystem
-from prefmpc.trajectories import Trajectory
+from prefmpc.preferences.trajectories import Trajectory
+from prefmpc.systems.linear import LinearSystem
+from prefmpc.systems.sets import Polyhedron
 
 Terminal = Polyhedron | TerminalIngredients
 

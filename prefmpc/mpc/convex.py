@@ -11,7 +11,8 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import instance, positive_int, single
 from prefmpc._units import cost_units, free_response, matters
-from prefmpc.models import QuadraticCost, SumCost
+from prefmpc.models.networks import ICNNCost
+from prefmpc.models.quadratic import QuadraticCost, SumCost
 from prefmpc.mpc._cone import ParametricProgram
 from prefmpc.mpc._expressions import (
     check_cones,
@@ -35,9 +36,8 @@ from prefmpc.mpc.solution import (
 )
 from prefmpc.mpc.stability import StabilityCheck
 from prefmpc.mpc.terminal import TerminalIngredients, check_polyhedron, terminal_set
-from prefmpc.networks import ICNNCost
-from prefmpc.sets import Ellipsoid, Polyhedron, SecondOrderCone
-from prefmpc.systems import LinearSystem
+from prefmpc.systems.linear import LinearSystem
+from prefmpc.systems.sets import Ellipsoid, Polyhedron, SecondOrderCone
 
 
 class ConvexMPC(Controller):

@@ -23,7 +23,7 @@ from prefmpc._checks import (
     single,
 )
 from prefmpc._pytree import bypass_init
-from prefmpc.models import CostModel, check_model
+from prefmpc.models.quadratic import CostModel, check_model
 from prefmpc.mpc import _nlp
 from prefmpc.mpc import _shooting as shooting
 from prefmpc.mpc._limits import ON_LIMIT
@@ -37,9 +37,9 @@ from prefmpc.mpc.solution import (
 )
 from prefmpc.mpc.steady import SteadyState, check_reference, with_reference
 from prefmpc.mpc.terminal import TerminalIngredients, check_polyhedron, terminal_set
-from prefmpc.sets import Ellipsoid, Polyhedron
-from prefmpc.systems import System
-from prefmpc.trajectories import Trajectory
+from prefmpc.preferences.trajectories import Trajectory
+from prefmpc.systems.linear import System
+from prefmpc.systems.sets import Ellipsoid, Polyhedron
 
 Solver = Literal["slsqp", "ipopt"]
 

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from jax.typing import ArrayLike
 
 from prefmpc._checks import positive_int, single
-from prefmpc.models import QuadraticCost
+from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.mpc._cone import PROVEN, SOLVED, TIGHT, ConeProgram, ConeSolution
 from prefmpc.mpc._refine import Refiner
 from prefmpc.mpc._stages import Bounds, StageProgram
@@ -27,8 +27,8 @@ from prefmpc.mpc.solution import (
 )
 from prefmpc.mpc.steady import SteadyState, check_reference, with_reference
 from prefmpc.mpc.terminal import TerminalIngredients, check_polyhedron, terminal_set
-from prefmpc.sets import Ellipsoid, Polyhedron
-from prefmpc.systems import LinearSystem
+from prefmpc.systems.linear import LinearSystem
+from prefmpc.systems.sets import Ellipsoid, Polyhedron
 
 # Polishing makes of this the exact answer; what is handed out is judged by its own residual.
 _SETTINGS = {

@@ -11,9 +11,9 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import finite_array, is_traced, shaped
 from prefmpc._pytree import bypass_init
-from prefmpc.models import QuadraticCost
-from prefmpc.systems import LinearSystem
-from prefmpc.trajectories import Trajectory
+from prefmpc.models.quadratic import QuadraticCost
+from prefmpc.preferences.trajectories import Trajectory
+from prefmpc.systems.linear import LinearSystem
 
 
 class MPCError(RuntimeError):

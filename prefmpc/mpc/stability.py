@@ -12,7 +12,8 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import finite_array, instance, nonnegative, shaped, single
 from prefmpc._units import cost_units
-from prefmpc.models import QuadraticCost, SumCost
+from prefmpc.models.networks import ICNNCost
+from prefmpc.models.quadratic import QuadraticCost, SumCost
 from prefmpc.mpc._cone import ConeSolution, ParametricProgram
 from prefmpc.mpc._expressions import (
     check_cones,
@@ -23,10 +24,9 @@ from prefmpc.mpc._expressions import (
 )
 from prefmpc.mpc.solution import MPCSolution
 from prefmpc.mpc.terminal import stage_constraints
-from prefmpc.networks import ICNNCost
-from prefmpc.sets import Polyhedron, SecondOrderCone
-from prefmpc.systems import LinearSystem
-from prefmpc.trajectories import Trajectory
+from prefmpc.preferences.trajectories import Trajectory
+from prefmpc.systems.linear import LinearSystem
+from prefmpc.systems.sets import Polyhedron, SecondOrderCone
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ from prefmpc._pytree import bypass_init
 from prefmpc.mpc._target import Target, input_sizes
 from prefmpc.mpc.solution import MPCSolution, check_dimension
 from prefmpc.mpc.terminal import stage_constraints
-from prefmpc.sets import Polyhedron
-from prefmpc.systems import LinearSystem, System
-from prefmpc.trajectories import Trajectory
+from prefmpc.preferences.trajectories import Trajectory
+from prefmpc.systems.linear import LinearSystem, System
+from prefmpc.systems.sets import Polyhedron
 
 REACHED = 1e-6
 STEPS = 50

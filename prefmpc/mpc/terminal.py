@@ -10,10 +10,10 @@ from scipy.optimize import linprog
 
 from prefmpc._checks import instance, nonnegative, positive_int, single
 from prefmpc._pytree import bypass_init
-from prefmpc.models import QuadraticCost
+from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.mpc.solution import check_dimension, check_problem
-from prefmpc.sets import Ellipsoid, Polyhedron
-from prefmpc.systems import LinearSystem, System
+from prefmpc.systems.linear import LinearSystem, System
+from prefmpc.systems.sets import Ellipsoid, Polyhedron
 
 ROUNDING = 1e-14
 WIDE = 1e6

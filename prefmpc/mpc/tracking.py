@@ -12,8 +12,8 @@ from prefmpc.mpc.nonlinear import NonlinearMPC
 from prefmpc.mpc.qp import LinearMPC
 from prefmpc.mpc.solution import Controller, MPCSolution, check_single_state, no_plan
 from prefmpc.mpc.steady import SteadyState, steady_state
-from prefmpc.sets import Polyhedron
-from prefmpc.systems import LinearSystem
+from prefmpc.systems.linear import LinearSystem
+from prefmpc.systems.sets import Polyhedron
 
 SAME = 1e-12
 """Relative changes of what no input moves up to this are rounding."""

@@ -1,0 +1,418 @@
+"""Learning a quadratic σ is a convex problem: one minimum, Newton's method, a certificate.
+
+σ is linear in (Q, R), so the negative log-likelihood of the answers is convex in them; a Wishart
+prior makes the problem strictly convex, and keeps Q and R positive definite. Nothing is random:
+the same data and prior give the same answer.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+import warnings
+from collections.abc import Sequence
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+from jax.typing import ArrayLike
+from scipy.special import ndtri
+
+from prefmpc._checks import (
+    finite_array,
+    instance,
+    instances,
+    nonnegative,
+    positive_int,
+    require_x64,
+    share,
+)
+from prefmpc._sharding import check_mesh
+from prefmpc.learning._newton import (
+    Entries,
+    Minimum,
+    Problem,
+    build,
+    pair_gaps,
+    solve,
+    solve_shared,
+)
+from prefmpc.learning.losses import FitError, padded_size
+from prefmpc.learning.priors import Structure, WishartPrior, free_entries
+from prefmpc.models.quadratic import QuadraticCost
+from prefmpc.preferences.comparisons import Comparisons
+from prefmpc.preferences.trajectories import Trajectory
+
+Status = Literal["converged", "max_iterations", "not_finite"]
+
+
+class Interval(NamedTuple):
+    """A posterior mean and the bounds of an interval about it, all of the same shape."""
+
+    mean: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class MapResult:
+    """The most probable (Q, R) after the answers.
+
+    Attributes
+    ----------
+    Q : array (nx, nx)
+    R : array (nu, nu)
+        As the solver left them; `model` refuses to hand out an unfinished one.
+    status : "converged", "max_iterations" or "not_finite".
+    objective : float
+        −log posterior up to a constant: Σ cross-entropy + the prior's term.
+    log_likelihood : float
+        −Σ cross-entropy, in nats.
+    decrement : float
+        λ²/2, half the squared Newton decrement at the last but one point: to second order its
+        distance from the minimum. Another full step followed.
+    iterations : int
+    seconds : float
+        Wall time, compilation included if there was one; of the whole call in `fit_maps`.
+    comparisons, prior, structure, outputs
+        What was asked.
+    """
+
+    Q: np.ndarray
+    R: np.ndarray
+    status: Status
+    objective: float
+    log_likelihood: float
+    decrement: float
+    iterations: int
+    seconds: float
+    comparisons: Comparisons = dataclasses.field(repr=False)
+    prior: WishartPrior = dataclasses.field(repr=False)
+    structure: Structure = dataclasses.field(repr=False)
+    outputs: np.ndarray | None = dataclasses.field(repr=False)
+    problem: Problem = dataclasses.field(repr=False)
+    minimum: Minimum = dataclasses.field(repr=False)
+
+    @property
+    def success(self) -> bool:
+        """Whether the decrement certifies the minimum."""
+        return self.status == "converged"
+
+    @property
+    def message(self) -> str:
+        """One sentence on how it went."""
+        return f"{self.status} after {self.iterations} Newton steps, decrement {self.decrement:.1e}"
+
+    def check(self) -> None:
+        """Raise a `FitError` unless the minimum was reached."""
+        if not self.success:
+            raise FitError(f"fit_map: {self.message}")
+
+    @property
+    def model(self) -> QuadraticCost:
+        """The learned σ. Raises a `FitError` unless the minimum was reached."""
+        self.check()
+        return QuadraticCost(self.Q, self.R)
+
+    @property
+    def sharpness(self) -> float:
+        """How sharp the answers are: the mean weight, in units of the prior's mode W₀.
+
+        tr(W₀⁻¹W) / d with the d × d matrix W = blkdiag(Q, R). σ is in log-odds, so that somebody
+        who answers half as surely has half the weights, and wants the same controller.
+        """
+        self.check()
+        W = self.problem.entries.matrix(self.minimum.w)
+        return float(np.trace(np.linalg.solve(self.problem.mode, W))) / len(W)
+
+    @property
+    def normalised(self) -> QuadraticCost:
+        """σ / `sharpness`: what is wanted, whatever the noise, so that people can be compared."""
+        sharpness = self.sharpness
+        return QuadraticCost(self.Q / sharpness, self.R / sharpness)
+
+    @property
+    def std_Q(self) -> np.ndarray:
+        """Standard deviations (nx, nx) of the entries of Q by Laplace's method.
+
+        From the inverse Hessian at the minimum: good with many answers. With few, the posterior
+        is not symmetric about its mode; see `posterior`.
+        """
+        return self._std()[0]
+
+    @property
+    def std_R(self) -> np.ndarray:
+        """Standard deviations (nu, nu) of the entries of R, likewise."""
+        return self._std()[1]
+
+    def _std(self) -> tuple[np.ndarray, np.ndarray]:
+        self.check()
+        basis = self.problem.in_user_units(np.eye(self.minimum.w.size))  # (p, d, d): ∂W/∂w
+        covariance = np.linalg.inv(self.minimum.hessian)
+        parts = split(basis, len(self.prior.Q), self.outputs)
+        Q, R = (np.sqrt(np.einsum("aij,ab,bij->ij", P, covariance, P)) for P in parts)
+        return Q, R
+
+    def probability(self, first: Trajectory, second: Trajectory, level: float = 0.9) -> Interval:
+        """Return P(first is preferred), and how sure we are of it, by Laplace's method.
+
+        The log-odds of a pair are linear in the weights, and so Gaussian if these are. Without
+        sampling, hence quick; `Posterior.probability` is better where answers are few.
+
+        Parameters
+        ----------
+        first, second : Trajectory
+            With equal batch shapes (...).
+        level : float
+            The share of the posterior between the bounds, with equal shares outside.
+
+        Returns
+        -------
+        Interval
+            Three arrays (...). The mean, of a logistic function of a Gaussian, is that of MacKay's
+            approximation.
+        """
+        self.check()
+        gap, batch, tail = new_gaps(self, first, second, level)
+        z = self.minimum.w @ gap
+        variance = np.einsum("an,an->n", gap, np.linalg.solve(self.minimum.hessian, gap))
+        reach = -ndtri(tail) * np.sqrt(variance)
+        odds = (z / np.sqrt(1 + np.pi * variance / 8), z - reach, z + reach)
+        return Interval(*((0.5 * (1 + np.tanh(0.5 * part))).reshape(batch) for part in odds))
+
+    def nearest_diagonal(self) -> MapResult:
+        """Return the best diagonal (Q, R) for the same answers: a few numbers that can be read.
+
+        What that costs is the difference of the two `log_likelihood`. Of the prior, the diagonal
+        is kept.
+        """
+        Q0, R0 = (np.diag(np.diag(mode)) for mode in (self.prior.Q, self.prior.R))
+        prior = WishartPrior(Q0, R0, self.prior.strength)
+        return fit_map(self.comparisons, prior, structure="diagonal", outputs=self.outputs)
+
+
+def fit_map(
+    comparisons: Comparisons,
+    prior: WishartPrior,
+    *,
+    structure: Structure = "full",
+    outputs: ArrayLike | None = None,
+    max_iterations: int = 100,
+    tol: float = 1e-8,
+    mesh: Mesh | None = None,
+) -> MapResult:
+    """Return the maximum a posteriori weights of a quadratic σ: one start, no randomness.
+
+    Minimises Σ_i cross-entropy(z_i, label_i) − log prior(Q, R) with the log-odds
+    z_i = σ(second_i) − σ(first_i), eq. (4) of arXiv 2511.22502, over positive definite Q and R,
+    by Newton's method with exact derivatives from the prior's mode.
+
+    Parameters
+    ----------
+    comparisons : Comparisons
+        Labels may be soft (0.5: cannot say); the noise of the answers is in the scale of Q and R.
+    prior : WishartPrior
+    structure : {"full", "diagonal"} or (mask of Q, mask of R)
+        Which entries may differ from zero. The prior's mode must have the same zeros. See
+        `blocks` for block-diagonal ones.
+    outputs : array (ny, nx), optional
+        C of y = C x: σ then sees outputs and inputs only. The prior weighs y, and the result is
+        Q = CᵀQ_yC.
+    tol : float
+        Stop when half the squared Newton decrement is below ``tol`` times 1 + abs(objective).
+    mesh : jax.sharding.Mesh, optional
+        Devices to share the comparisons among; they may belong to several processes, which then
+        all make the same call.
+
+    Returns
+    -------
+    MapResult
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range, or prior and trajectories do not fit each other.
+    """
+    instance("comparisons", comparisons, Comparisons)
+    instance("prior", prior, WishartPrior)
+    mesh = None if mesh is None else check_mesh(mesh)
+    results = _solved([comparisons], [prior], structure, outputs, max_iterations, tol, mesh)
+    _warn_of_failures(results)
+    return results[0]
+
+
+def fit_maps(
+    comparisons: Comparisons | Sequence[Comparisons],
+    priors: WishartPrior | Sequence[WishartPrior],
+    *,
+    structure: Structure = "full",
+    outputs: ArrayLike | None = None,
+    max_iterations: int = 100,
+    tol: float = 1e-8,
+) -> list[MapResult]:
+    """Solve many problems of `fit_map` in one compiled call: many data sets, or many priors.
+
+    Parameters
+    ----------
+    comparisons : Comparisons, or a sequence of them
+    priors : WishartPrior, or a sequence of them
+        One of something goes with all of the other; two sequences go pair by pair.
+
+    Returns
+    -------
+    list of MapResult
+    """
+    data_sets, beliefs = _paired(comparisons, priors)
+    results = _solved(data_sets, beliefs, structure, outputs, max_iterations, tol)
+    _warn_of_failures(results)
+    return results
+
+
+def _solved(
+    data_sets: list[Comparisons],
+    beliefs: list[WishartPrior],
+    structure: Structure,
+    outputs: ArrayLike | None,
+    max_iterations: int,
+    tol: float,
+    mesh: Mesh | None = None,
+) -> list[MapResult]:
+    require_x64()
+    began = time.perf_counter()
+    limit, tol = positive_int("max_iterations", max_iterations), nonnegative("tol", tol)
+    C, entries = check(data_sets, beliefs, structure, outputs)
+    parts = 1 if mesh is None else mesh.size
+    size = parts * padded_size(max(-(-len(data) // parts) for data in data_sets))
+    if all(data is data_sets[0] for data in data_sets):
+        problems = build(data_sets[0], beliefs, entries, C, size)
+    else:
+        pairs = zip(data_sets, beliefs, strict=True)
+        problems = [build(data, [prior], entries, C, size)[0] for data, prior in pairs]
+    if mesh is None:
+        minima = solve(problems, tol, limit)
+    else:
+        minima = [solve_shared(problem, tol, limit, mesh) for problem in problems]
+    results = []
+    for problem, minimum, data, prior in zip(problems, minima, data_sets, beliefs, strict=True):
+        Q, R = split(problem.in_user_units(minimum.w), len(prior.Q), C)
+        results.append(
+            MapResult(
+                Q=Q,
+                R=R,
+                status=_status(minimum, Q, R, tol),
+                # log det in the user's units
+                objective=float(minimum.objective) + prior.strength * problem.log_unit,
+                log_likelihood=float(minimum.log_likelihood),
+                decrement=float(minimum.decrement),
+                iterations=int(minimum.steps),
+                seconds=time.perf_counter() - began,
+                comparisons=data,
+                prior=prior,
+                structure=structure,
+                outputs=C,
+                problem=problem,
+                minimum=minimum,
+            )
+        )
+    return results
+
+
+def _warn_of_failures(results: list[MapResult]) -> None:
+    """Warn the caller of the public function that called this one."""
+    if bad := [result for result in results if not result.success]:
+        many = f" ({len(bad)} of {len(results)} problems)" if len(results) > 1 else ""
+        warnings.warn(f"fit_map: {bad[0].message}{many}", RuntimeWarning, stacklevel=3)
+
+
+def new_gaps(
+    result: MapResult, first: Any, second: Any, level: float
+) -> tuple[np.ndarray, tuple[int, ...], float]:
+    """Return the moment differences (p, n) of new pairs, their batch shape and (1 − level) / 2."""
+    level = share("level", level)
+    instance("first", first, Trajectory)
+    instance("second", second, Trajectory)
+    shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(side)] for side in (first, second)]
+    trained = result.comparisons.trajectories
+    channels = [side.shape[-1] for side in (trained.x, trained.u)]
+    if shapes[0] != shapes[1] or [first.x.shape[-1], first.u.shape[-1]] != channels:
+        raise ValueError(
+            f"first and second must have equal shapes with {channels[0]} states and "
+            f"{channels[1]} inputs, got {shapes[0]} and {shapes[1]}"
+        )
+    batch = first.batch_shape
+    flat = [
+        jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(batch) :]), side)
+        for side in (first, second)
+    ]
+    n = len(flat[0])
+    one, other = flat
+    pairs = Comparisons.from_arrays(one.x, one.u, other.x, other.u, np.full(n, 0.5))
+    problem = result.problem
+    gap = pair_gaps(pairs, problem.entries, problem.unit, result.outputs)
+    return gap, batch, (1 - level) / 2
+
+
+def split(W: np.ndarray, nq: int, outputs: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Return Q (..., nx, nx) and R (..., nu, nu) of matrices W (..., d, d) = blkdiag(Q, R)."""
+    Q, R = W[..., :nq, :nq], W[..., nq:, nq:]
+    return (Q if outputs is None else outputs.T @ Q @ outputs), R
+
+
+def check(
+    data_sets: Sequence[Comparisons],
+    priors: Sequence[WishartPrior],
+    structure: Structure,
+    outputs: ArrayLike | None,
+) -> tuple[np.ndarray | None, Entries]:
+    """Return C and the free entries; raise a ValueError unless everything fits together."""
+    first = data_sets[0].trajectories
+    nx, nu = first.x.shape[-1], first.u.shape[-1]
+    C = None
+    if outputs is not None:
+        C = np.asarray(finite_array("outputs", outputs, ndim=2))
+        if C.shape[1] != nx:
+            raise ValueError(f"outputs must have {nx} columns, one a state, got shape {C.shape}")
+    nq, what = (nx, "states") if C is None else (C.shape[0], "outputs")
+    for data in data_sets[1:]:
+        sizes = data.trajectories.x.shape[-1], data.trajectories.u.shape[-1]
+        if sizes != (nx, nu):
+            raise ValueError(
+                f"comparisons must all have {nx} states and {nu} inputs, "
+                f"got {sizes[0]} and {sizes[1]}"
+            )
+    for prior in priors:
+        if prior.Q.shape != (nq, nq) or prior.R.shape != (nu, nu):
+            raise ValueError(
+                f"prior must weigh {nq} {what} and {nu} inputs, "
+                f"got Q {prior.Q.shape} and R {prior.R.shape}"
+            )
+        rows, columns = free_entries(structure, prior)
+    return C, Entries.of(rows, columns)
+
+
+def _paired(
+    comparisons: Comparisons | Sequence[Comparisons],
+    priors: WishartPrior | Sequence[WishartPrior],
+) -> tuple[list[Comparisons], list[WishartPrior]]:
+    one_set, one_prior = isinstance(comparisons, Comparisons), isinstance(priors, WishartPrior)
+    data_sets: list[Any] = (
+        [comparisons] if one_set else instances("comparisons", comparisons, Comparisons)
+    )
+    beliefs: list[Any] = [priors] if one_prior else instances("priors", priors, WishartPrior)
+    if one_set:
+        data_sets *= len(beliefs)
+    elif one_prior:
+        beliefs *= len(data_sets)
+    if len(data_sets) != len(beliefs):
+        raise ValueError(
+            "comparisons and priors must be equally many, or one of them a single one, "
+            f"got {len(data_sets)} and {len(beliefs)}"
+        )
+    return data_sets, beliefs
+
+
+def _status(minimum: Minimum, Q: np.ndarray, R: np.ndarray, tol: float) -> Status:
+    if not (np.isfinite(Q).all() and np.isfinite(R).all() and np.isfinite(minimum.objective)):
+        return "not_finite"
+    return "converged" if minimum.converged(tol) else "max_iterations"

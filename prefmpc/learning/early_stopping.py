@@ -1,0 +1,281 @@
+"""Training σ models that are not convex: many restarts, stopped where held-out answers suffer."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+import warnings
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from prefmpc._checks import flag, instance, nonnegative, positive_int, require_x64, share, to_numpy
+from prefmpc._random import generator
+from prefmpc.learning.losses import (
+    FitError,
+    PairData,
+    cross_entropy,
+    objective,
+    padded_size,
+    pair_data,
+)
+from prefmpc.learning.training import adam, adam_step, check_starts, held_out_count
+from prefmpc.models.quadratic import CostModel
+from prefmpc.preferences.comparisons import Comparisons
+
+CHECK_EVERY = 10
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkFit:
+    """Restarts of `fit_network`, each at its best moment, and which one was chosen.
+
+    Attributes
+    ----------
+    models : the models with the smallest validation loss of each restart, stacked.
+    chosen : int or None
+        The restart with the smallest validation loss; None if none stayed finite.
+    validation_loss, training_loss : array (checks, restarts)
+        Cross-entropy of held-out and of trained answers, at every check; NaN after the end of a
+        restart.
+    epochs : int array (checks,)
+        Passes over the data until each check.
+    best : int array (restarts,)
+        The check at which each restart was best.
+    status : array of str (restarts,)
+        "stopped": the validation loss had not fallen for ``patience`` checks; "max_epochs": it
+        was still falling; "not_finite": a loss or a weight left the numbers, and the restart is
+        not chosen.
+    seconds : float
+    """
+
+    models: Any
+    chosen: int | None
+    validation_loss: np.ndarray
+    training_loss: np.ndarray
+    epochs: np.ndarray
+    best: np.ndarray
+    status: np.ndarray
+    seconds: float
+
+    @property
+    def success(self) -> bool:
+        """Whether at least one restart stayed finite."""
+        return self.chosen is not None
+
+    @property
+    def message(self) -> str:
+        """One sentence on how it went."""
+        names, counts = np.unique(self.status, return_counts=True)
+        seen = ", ".join(f"{c} {n}" for n, c in zip(names, counts, strict=True))
+        if self.chosen is None:
+            return f"{self.status.size} restarts: {seen}; none usable"
+        loss = self.validation_loss[self.best[self.chosen], self.chosen]
+        return (
+            f"{self.status.size} restarts: {seen}; restart {self.chosen} chosen, "
+            f"validation loss {loss:.4g}"
+        )
+
+    @property
+    def model(self) -> Any:
+        """The chosen model. Raises a `FitError` if there is none."""
+        if self.chosen is None:
+            raise FitError(f"{self.message}. The models as they were are in .models")
+        return jax.tree.map(lambda leaf: leaf[self.chosen], self.models)
+
+
+def fit_network(
+    comparisons: Comparisons,
+    initial: CostModel,
+    *,
+    key: Any,
+    validation: Comparisons | None = None,
+    validation_fraction: float = 0.2,
+    l2: float = 1e-4,
+    learning_rate: float = 0.01,
+    max_epochs: int = 2000,
+    patience: int = 20,
+    batch_size: int = 1024,
+    progress: bool = False,
+) -> NetworkFit:
+    """Train σ by Adam from many starts at once, and keep each where held-out answers are best.
+
+    Minimises eq. (6) of arXiv 2511.22502 on the answers that are not held out. Every ten epochs
+    the held-out ones are scored; a restart ends when their cross-entropy has not fallen for
+    ``patience`` of these checks. Weights are projected onto the model's bounds after each step.
+
+    Parameters
+    ----------
+    comparisons : Comparisons
+    initial : model
+        The starts, stacked along a leading axis, for instance ``MLPCost.random(..., shape=(8,))``.
+    key : JAX random key
+        Draws the split and the mini-batches.
+    validation : Comparisons, optional
+        Held-out answers of your own, for instance about other trajectories. Default: a random
+        share of ``validation_fraction`` of the pairs.
+    l2 : float
+        Weight of ‖θ‖².
+    learning_rate : float
+        Of Adam, with decay rates 0.9 and 0.999.
+    max_epochs, patience : int
+    batch_size : int
+        Data sets with more pairs are passed over in random mini-batches, as few and as equal as
+        this size allows: in an epoch each pair comes up once.
+    progress : bool
+        Show a progress bar.
+
+    Raises
+    ------
+    ValueError
+        If an argument is out of range, or the starts do not fit the data.
+    """
+    require_x64()
+    began = time.perf_counter()
+    instance("comparisons", comparisons, Comparisons)
+    starts = check_starts(comparisons, initial)
+    settings = nonnegative("l2", l2), nonnegative("learning_rate", learning_rate)
+    rounds = -(-positive_int("max_epochs", max_epochs) // CHECK_EVERY)
+    patience, batch_size = (
+        positive_int("patience", patience),
+        positive_int("batch_size", batch_size),
+    )
+    rng, progress = generator(key), flag("progress", progress)
+    validation_fraction = share("validation_fraction", validation_fraction)
+    training, held_out = _split(comparisons, validation, validation_fraction, rng)
+    data = pair_data(starts, training, padded_size(len(training)))
+    test = pair_data(starts, held_out, padded_size(len(held_out), 128))
+
+    state = _begin(starts)
+    best = to_numpy(state[0])
+    restarts = len(jax.tree.leaves(best)[0])
+    lowest, since = np.full(restarts, np.inf), np.zeros(restarts, dtype=int)
+    running, best_at = np.ones(restarts, dtype=bool), np.zeros(restarts, dtype=int)
+    finite = np.ones(restarts, dtype=bool)
+    histories: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+    for i in _bar(rounds, progress):
+        batches = _batches(len(training), data.labels.size, batch_size, rng)
+        state, losses = _advance(state, data, test, settings, batches)
+        trained, held = (np.array(part) for part in losses)
+        trained[~running], held[~running] = np.nan, np.nan
+        histories[0].append(trained)
+        histories[1].append(held)
+        models = to_numpy(state[0])
+        # A weight that is NaN need not show in the losses: a ReLU may pass over it.
+        finite &= ~running | (np.isfinite(held) & np.isfinite(trained) & _finite(models))
+        better = running & finite & (held < lowest)
+        best = jax.tree.map(lambda old, new, b=better: _where(b, new, old), best, models)
+        lowest, best_at = np.where(better, held, lowest), np.where(better, i, best_at)
+        since = np.where(better, 0, since + 1)
+        running &= finite & (since < patience)
+        if not running.any():
+            break
+    status = np.where(running, "max_epochs", "stopped").astype("<U10")
+    usable = finite & np.isfinite(lowest)
+    status[~usable] = "not_finite"
+    result = NetworkFit(
+        models=best,
+        chosen=int(np.argmin(np.where(usable, lowest, np.inf))) if usable.any() else None,
+        validation_loss=np.stack(histories[1]),
+        training_loss=np.stack(histories[0]),
+        epochs=CHECK_EVERY * np.arange(1, len(histories[0]) + 1),
+        best=best_at,
+        status=status,
+        seconds=time.perf_counter() - began,
+    )
+    if not result.success:
+        warnings.warn(f"fit_network: {result.message}", RuntimeWarning, stacklevel=2)
+    return result
+
+
+def _split(
+    comparisons: Comparisons, validation: Any, fraction: float, rng: np.random.Generator
+) -> tuple[Comparisons, Comparisons]:
+    if validation is not None:
+        instance("validation", validation, Comparisons)
+        return comparisons, validation
+    held = held_out_count(len(comparisons), fraction)
+    order = rng.permutation(len(comparisons))
+    return comparisons.subset(order[held:]), comparisons.subset(order[:held])
+
+
+def _bar(rounds: int, progress: bool) -> Any:
+    if not progress:
+        return range(rounds)
+    from tqdm import tqdm
+
+    return tqdm(range(rounds), desc=f"{CHECK_EVERY} epochs each")
+
+
+def _where(mask: np.ndarray, new: Any, old: Any) -> Any:
+    return np.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+
+def _finite(models: Any) -> np.ndarray:
+    """Say which models of a stack have finite weights only."""
+    leaves = jax.tree.leaves(models)
+    return np.all([np.isfinite(leaf).reshape(len(leaf), -1).all(axis=1) for leaf in leaves], axis=0)
+
+
+def _batches(n: int, padded: int, size: int, rng: np.random.Generator) -> Any:
+    """Return ten epochs of mini-batches (rows, size) and how many rows to take of them.
+
+    None for all pairs at once. What is free in a row, and the rows that are not taken, hold the
+    index ``padded``, behind the last pair: one shape, and one compilation, for many data sets.
+    """
+    if n <= size:
+        return None
+    count = -(-n // size)
+    rows = np.full((CHECK_EVERY * -(-padded // size), size), padded)
+    for epoch in range(CHECK_EVERY):
+        parts = np.array_split(rng.permutation(n), count)
+        for row, part in zip(rows[epoch * count :], parts, strict=False):
+            row[: part.size] = part
+    return rows, CHECK_EVERY * count
+
+
+@jax.jit
+def _begin(starts: Any) -> tuple[Any, Any]:
+    lower, upper = starts.bounds()
+    inside = jax.tree.map(jnp.clip, starts, lower, upper)
+    return inside, jax.vmap(adam(0.0).init)(inside)
+
+
+@jax.jit
+def _advance(
+    state: Any, data: PairData, test: PairData, settings: Any, batches: Any
+) -> tuple[Any, Any]:
+    """Train for ten epochs; return the state, and the losses of trained and held-out answers."""
+    l2, learning_rate = settings
+
+    def one(model: Any, memory: Any) -> Any:
+        bounds = model.bounds()
+
+        def step(k: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
+            part = data if batches is None else _part(data, batches[0][k])
+            slope = jax.grad(objective)(carry[0], part, l2)
+            return adam_step(*carry, slope, bounds, learning_rate)
+
+        steps = CHECK_EVERY if batches is None else batches[1]
+        model, memory = jax.lax.fori_loop(0, steps, step, (model, memory))
+        return (model, memory), (cross_entropy(model, data), cross_entropy(model, test))
+
+    return jax.vmap(one)(*state)
+
+
+def _part(data: PairData, chosen: Any) -> PairData:
+    """Return a mini-batch: only its own trajectories are scored.
+
+    An index behind the last pair stands for none: a weight of 0, with some other pair's numbers.
+    """
+    labels = data.labels[chosen]
+    weights = data.weights.at[chosen].get(mode="fill", fill_value=0.0)
+    if data.sides is None:
+        features = jax.tree.map(lambda leaf: leaf[chosen], data.features)
+        return PairData(None, features, labels, weights)
+    used = jnp.concatenate([side[chosen] for side in data.sides])
+    features = jax.tree.map(lambda leaf: leaf[used], data.features)
+    places = np.arange(2 * len(chosen)).reshape(2, -1)
+    return PairData((places[0], places[1]), features, labels, weights)

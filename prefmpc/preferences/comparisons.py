@@ -1,0 +1,294 @@
+"""Data sets of compared pairs: who was shown against whom, and what was answered."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from jax.typing import ArrayLike
+
+from prefmpc._checks import finite_array, flag, function, indices, positive_int
+from prefmpc._files import atomic_write
+from prefmpc._random import generator
+from prefmpc.preferences.people import Preference, asked
+from prefmpc.preferences.trajectories import Trajectory, failed
+
+_FORMAT_VERSIONS = (1, 2)  # (x, u, y) alone, and with what is optional
+_OPTIONAL = ("x_r", "u_r", "y_r", "u_before")
+
+
+@dataclasses.dataclass(frozen=True, eq=False, init=False)
+class Comparisons:
+    """A data set D of compared pairs: who was shown against whom, and what was answered.
+
+    Parameters
+    ----------
+    trajectories : Trajectory
+        With leading dimension n_t, all finite: drop closed loops that failed.
+    first, second : int array (n,)
+        Which trajectories stand in each pair.
+    labels : array (n,)
+        P(first is preferred) in [0, 1]: 1 first, 0 second, 0.5 cannot say.
+
+    Raises
+    ------
+    ValueError
+        If there is no pair, an index points nowhere, a label lies outside [0, 1], or a trajectory
+        holds NaN.
+    """
+
+    trajectories: Trajectory
+    first: np.ndarray
+    second: np.ndarray
+    labels: np.ndarray
+
+    def __init__(
+        self, trajectories: Trajectory, first: ArrayLike, second: ArrayLike, labels: ArrayLike
+    ) -> None:
+        _check_pool(trajectories)
+        labels = np.asarray(finite_array("labels", labels, ndim=1, booleans=True))
+        if labels.size == 0:
+            raise ValueError("labels must hold at least one comparison, got an empty data set")
+        if labels.min() < 0 or labels.max() > 1:
+            i = int(np.flatnonzero((labels < 0) | (labels > 1))[0])
+            raise ValueError(
+                f"labels must lie in [0, 1] (P(first is preferred)), got {labels[i]:g} at index {i}"
+            )
+        values: dict[str, Any] = {
+            "trajectories": trajectories,
+            "first": _pair_indices("first", first, labels.size, len(trajectories)),
+            "second": _pair_indices("second", second, labels.size, len(trajectories)),
+            "labels": labels,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        """Number of comparisons n_p."""
+        return int(self.labels.size)
+
+    @property
+    def pairs(self) -> tuple[Trajectory, Trajectory]:
+        """The first and the second trajectory of every pair, each with leading dimension n_p."""
+        return self.trajectories[self.first], self.trajectories[self.second]
+
+    @classmethod
+    def random(
+        cls,
+        trajectories: Trajectory,
+        preference: Preference,
+        size: int,
+        *,
+        key: Any,
+        same_start: bool = False,
+    ) -> Comparisons:
+        """Draw ``size`` random pairs of two different trajectories and ask ``preference``.
+
+        Pairs are drawn independently, so that one may come up twice. ``preference`` is called
+        once, with two batches; wrap a function of single pairs in `one_by_one`. Pairs that it
+        does not answer (NaN) are left out: there are then fewer than ``size``.
+
+        Parameters
+        ----------
+        same_start : bool
+            Draw only pairs with the same x(0), so that nothing but the control differs. The
+            trajectories must then hold some that start alike (see `lqr_pool`).
+        """
+        _check_pool(trajectories)
+        function("preference", preference, 2)
+        size = positive_int("size", size)
+        count = len(trajectories)
+        if count < 2:
+            raise ValueError(f"trajectories must hold at least two to compare, got {count}")
+        rng = generator(key)
+        if flag("same_start", same_start):
+            first, second = _pairs_from_one_start(trajectories, size, rng)
+        else:
+            first = rng.integers(0, count, size)
+            second = (first + rng.integers(1, count, size)) % count
+        labels = asked("preference", preference, trajectories[first], trajectories[second])
+        answered = ~np.isnan(labels)
+        if not answered.any():
+            raise ValueError(f"preference must answer some pairs, it answered none of {size}")
+        return cls(trajectories, first[answered], second[answered], labels[answered])
+
+    def sampled(self, *, key: Any) -> Comparisons:
+        """Draw an answer 0 or 1 for every pair, 1 with the probability that its label gives."""
+        answers = generator(key).uniform(size=len(self)) < self.labels
+        return Comparisons(self.trajectories, self.first, self.second, answers.astype(float))
+
+    @classmethod
+    def from_arrays(
+        cls,
+        x_first: ArrayLike,
+        u_first: ArrayLike,
+        x_second: ArrayLike,
+        u_second: ArrayLike,
+        labels: ArrayLike,
+        *,
+        y_first: ArrayLike | None = None,
+        y_second: ArrayLike | None = None,
+    ) -> Comparisons:
+        """Build a data set from your own recordings: plain arrays and labels.
+
+        Parameters
+        ----------
+        x_first, x_second : array (n, N + 1, nx)
+        u_first, u_second : array (n, N, nu)
+        labels : array (n,)
+            P(first is preferred): 1 first, 0 second, 0.5 cannot say.
+        y_first, y_second : array (n, N, ny), optional
+        """
+        first = _recorded("first", x_first, u_first, y_first)
+        second = _recorded("second", x_second, u_second, y_second)
+        shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(side)] for side in (first, second)]
+        if len(first.batch_shape) != 1 or shapes[0] != shapes[1]:
+            raise ValueError(
+                "first and second must have equal shapes with one leading dimension, got x_first "
+                f"{np.shape(first.x)}, x_second {np.shape(second.x)}, u_first {np.shape(first.u)}, "
+                f"u_second {np.shape(second.u)}, y_first {np.shape(first.y)} and y_second "
+                f"{np.shape(second.y)}"
+            )
+        n = len(first)
+        answers = finite_array("labels", labels, booleans=True)
+        if answers.size and answers.shape != (n,):
+            raise ValueError(f"labels must have shape ({n},), one a pair, got {answers.shape}")
+        both = jax.tree.map(lambda a, b: np.concatenate([a, b]), first, second)
+        return cls(both, np.arange(n), np.arange(n, 2 * n), answers)
+
+    def subset(self, index: ArrayLike) -> Comparisons:
+        """Return the comparisons chosen by an integer or boolean index, in that order."""
+        chosen, n = indices("index", index), len(self)
+        if chosen.dtype == bool:
+            fits = chosen.shape == (n,) and bool(chosen.any())
+        else:
+            inside = (chosen >= -n) & (chosen < n)
+            fits = chosen.ndim == 1 and chosen.size > 0 and bool(inside.all())
+        if not fits:
+            raise ValueError(f"index must choose among the {n} comparisons, got {chosen}")
+        return Comparisons(
+            self.trajectories, self.first[chosen], self.second[chosen], self.labels[chosen]
+        )
+
+    def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
+        """Write everything to one ``.npz`` file; an interrupted write leaves an old file whole.
+
+        A file that is replaced keeps its permissions, and a symbolic link is followed. What a
+        killed process left behind is removed by the next `save` to the same file.
+
+        Raises
+        ------
+        FileExistsError
+            If ``path`` exists and ``overwrite`` is False. Of several processes that save to one
+            new path at once, one succeeds.
+        ValueError
+            If ``path`` does not end in ``.npz``.
+        OSError
+            If the file cannot be written.
+        """
+        target = Path(path)
+        if target.suffix != ".npz":
+            raise ValueError(f"path must end in .npz, got {str(path)!r}")
+        with atomic_write(target, overwrite=flag("overwrite", overwrite)) as file:
+            np.savez_compressed(file, **self._stored())
+        return target
+
+    def _stored(self) -> dict[str, Any]:
+        T = self.trajectories
+        arrays = {"x": T.x, "u": T.u, "y": T.y}
+        optional = {name: getattr(T, name) for name in _OPTIONAL}
+        optional = {name: value for name, value in optional.items() if value is not None}
+        pairs = {"first": self.first, "second": self.second, "labels": self.labels}
+        # A reader that does not know set points must refuse them, not lose them.
+        version = _FORMAT_VERSIONS[bool(optional)]
+        stored = {"format_version": version, **arrays, **optional, **pairs}
+        return {name: np.asarray(value) for name, value in stored.items()}
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Comparisons:
+        """Read a file that `save` wrote; a ValueError says what is wrong with any other file."""
+        try:
+            with np.load(Path(path), allow_pickle=False) as file:
+                stored = {name: file[name] for name in file.files}
+        except FileNotFoundError:
+            raise
+        except Exception as error:
+            raise ValueError(f"path must be a readable .npz file, got {path}: {error}") from None
+        wanted = {"format_version", "x", "u", "y", "first", "second", "labels"}
+        if missing := sorted(wanted - stored.keys()):
+            raise ValueError(f"path must be a file of saved comparisons, {path} lacks {missing}")
+        version = stored["format_version"]
+        if version.shape != () or version not in _FORMAT_VERSIONS:
+            raise ValueError(
+                f"path must hold format version {_FORMAT_VERSIONS}, got {version} in {path}"
+            )
+        optional = {name: stored[name] for name in _OPTIONAL if name in stored}
+        trajectories = Trajectory(stored["x"], stored["u"], stored["y"], **optional)
+        return cls(trajectories, stored["first"], stored["second"], stored["labels"])
+
+
+def _recorded(side: str, x: ArrayLike, u: ArrayLike, y: ArrayLike | None) -> Trajectory:
+    try:
+        return Trajectory(x, u, y)
+    except ValueError as error:
+        names = f"x_{side}, u_{side} and y_{side}"
+        raise ValueError(f"{names} do not fit: {error}") from None
+
+
+def _check_pool(trajectories: Any) -> None:
+    if not isinstance(trajectories, Trajectory):
+        raise ValueError(
+            f"trajectories must be a Trajectory, got {type(trajectories).__name__}; "
+            "from plain arrays: Comparisons.from_arrays"
+        )
+    if len(trajectories.batch_shape) != 1:
+        raise ValueError(
+            "trajectories must have one leading dimension (n_t trajectories), "
+            f"got batch shape {trajectories.batch_shape}"
+        )
+    if (bad := failed(trajectories)).any():
+        raise ValueError(
+            f"trajectories must be finite, got {int(bad.sum())} of {bad.size} with NaN or infinite "
+            f"values (closed loops that failed?), the first at index {int(np.argmax(bad))}"
+        )
+
+
+def _pairs_from_one_start(
+    trajectories: Trajectory, size: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    _, group = np.unique(np.asarray(trajectories.x[:, 0]), axis=0, return_inverse=True)
+    order = np.argsort(group, kind="stable")
+    count = np.bincount(group)
+    begin = np.cumsum(count) - count
+    place = np.empty_like(order)
+    place[order] = np.arange(order.size)
+    place -= begin[group]  # of each trajectory among those with its start
+    candidates = np.flatnonzero(count[group] > 1)
+    if not candidates.size:
+        raise ValueError(
+            "trajectories must hold two with the same x(0) for same_start=True, "
+            f"all {order.size} start in different states"
+        )
+    first = rng.choice(candidates, size)
+    mates = count[group[first]]
+    gap = 1 + rng.integers(0, mates - 1)
+    return first, order[begin[group[first]] + (place[first] + gap) % mates]
+
+
+def _pair_indices(name: str, value: ArrayLike, size: int, count: int) -> np.ndarray:
+    index = indices(name, value)
+    if index.shape != (size,) or index.dtype == bool:
+        raise ValueError(
+            f"{name} must hold {size} whole numbers, one for each label, "
+            f"got shape {index.shape} of {index.dtype}"
+        )
+    if index.min() < 0 or index.max() >= count:
+        raise ValueError(
+            f"{name} must point into the {count} trajectories (0 to {count - 1}), "
+            f"got {index.min()} to {index.max()}"
+        )
+    return index
