@@ -5,11 +5,10 @@ product (200×20)(20×20) in a compiled loop, of which `closed_loops` consists. 
 arithmetic at the rate of the large product or the traffic at that of the copy, whichever takes
 longer; the second, tighter one has the rate of the small product.
 
-Closed loops, in each step for m states with n = N·nu inputs: 2m·(nx·n) for the linear term, 2m·n²
-each for the unconstrained minimum and for the step that certifies it, 2m·nx·(nx + nu) + 2m·ny·nx
-for the plant; in each active-set iteration 3 products of 2m·n² and one more for each
-conjugate-gradient step, taken as the number of active rows. The whole batch takes part until its
-last state is done: ``flops``. ``needed`` counts only the iterations that each state has itself.
+Closed loops, in each step for m states with n = N·nu inputs: 2m·nx·n for the unconstrained plan,
+2m·nx·(nx + nu) + 2m·ny·nx for the plant; in each active-set iteration 2 products of 2m·n² and one
+more for each conjugate-gradient step, taken as the number of active rows. The whole batch takes
+part until its last state is done: ``flops``. ``needed`` counts only the iterations that each state has itself.
 Traffic: what comes out; everything else stays in the cache.
 
 Learning, in each Newton step for n comparisons of p weights: 2n·p·(p + 1) for Hessian and gradient,
@@ -82,11 +81,11 @@ def loop_counts(case: Case, tol: float) -> dict[str, float]:
         answer = solver.solve(x)
         active = (np.abs(answer.trajectory.u).reshape(m, n) >= system.u_max[0] - 1e-9).sum(1)
         rounds, deepest = int(answer.iterations.max()), int(active.max())
-        own = answer.iterations * (3 + active)
+        own = answer.iterations * (2 + active)
         fixed = 2.0 * m * (nx * n + nx * (nx + nu) + ny * nx)
-        products += 2 + rounds * (3 + deepest)
-        flops += fixed + 2.0 * m * n**2 * (2 + rounds * (3 + deepest))
-        needed += fixed + 2.0 * n**2 * (2.0 * m + own.sum())
+        products += rounds * (2 + deepest)
+        flops += fixed + 2.0 * m * n**2 * rounds * (2 + deepest)
+        needed += fixed + 2.0 * n**2 * own.sum()
         x = answer.trajectory.x[:, 1]
     return {
         "flops": flops,
