@@ -128,7 +128,7 @@ def loops(case: Case, speed: dict[str, float], repeats: int) -> dict[str, Any]:
         "dispatch_seconds": dispatch,
         **counts,
         **floors(counts, speed, seconds),
-        "microseconds_per_product": 1e6 * program / counts["products"],
+        "microseconds_per_product": 1e6 * program / max(counts["products"], 1),
     }
 
 
