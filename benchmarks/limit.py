@@ -8,8 +8,8 @@ longer; the second, tighter one has the rate of the small product.
 Closed loops, in each step for m states with n = N·nu inputs: 2m·nx·n for the unconstrained plan,
 2m·nx·(nx + nu) + 2m·ny·nx for the plant; in each active-set iteration 2 products of 2m·n² and one
 more for each conjugate-gradient step, taken as the number of active rows. The whole batch takes
-part until its last state is done: ``flops``. ``needed`` counts only the iterations that each state has itself.
-Traffic: what comes out; everything else stays in the cache.
+part until its last state is done: ``flops``. ``needed`` counts only the iterations that each state
+has itself. Traffic: what comes out; everything else stays in the cache.
 
 Learning, in each Newton step for n comparisons of p weights: 2n·p·(p + 1) for Hessian and gradient,
 3n·p for weighing the data and 2n·p for the step's log-odds; the data are read twice, and about ten

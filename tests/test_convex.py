@@ -22,15 +22,14 @@ from prefmpc import (
     blocks,
     bryson,
     choose_prior,
-    convex,
     erring,
     fit_map,
     fit_maps,
     lqr_pool,
     oscillating_masses,
     second_moments,
-    selection,
 )
+from prefmpc.learning import convex, selection
 from studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
 
 POOL = lqr_pool(

@@ -13,12 +13,12 @@ from prefmpc import (
     MLPCost,
     QuadraticCost,
     accuracy,
-    early_stopping,
     fit_network,
     logistic,
     lqr_pool,
     oscillating_masses,
 )
+from prefmpc.learning import early_stopping
 from prefmpc.learning.early_stopping import _batches, _part
 from prefmpc.learning.losses import cross_entropy, padded_size, pair_data
 from studies import RADIUS

@@ -14,17 +14,9 @@ from hypothesis import strategies as st
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize
 
-from prefmpc import (
-    Comparisons,
-    CostModel,
-    FitError,
-    QuadraticCost,
-    Trajectory,
-    accuracy,
-    fit,
-    training,
-)
+from prefmpc import Comparisons, CostModel, FitError, QuadraticCost, Trajectory, accuracy, fit
 from prefmpc._pytree import register_pytree
+from prefmpc.learning import training
 from prefmpc.learning._lbfgsb import minimise
 from prefmpc.learning.losses import PairData, cross_entropy, logits, objective, pair_data
 from prefmpc.learning.training import best_restart
