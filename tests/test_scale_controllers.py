@@ -79,7 +79,8 @@ def test_plans_are_the_same_plans(kind, cases):
         ]
         plain, scaled = answers
         assert scaled.status == plain.status
-        failed += plain.status == "failed"
+        # What no plan can be told from is another verdict, see test_trusted_plans.
+        failed += plain.status == "failed" and "always leave a plan" not in plain.message
         if plain.success:
             solved += 1
             assert near(scaled.trajectory.u / case.su, plain.trajectory.u)

@@ -111,6 +111,17 @@ def test_a_claim_of_infeasibility_needs_a_proof(monkeypatch, proof):
     assert "with a proof that is off by" in answer.message
 
 
+@pytest.mark.parametrize("kind", [LinearMPC, ConvexMPC])
+def test_input_bounds_alone_are_never_infeasible(kind):
+    # No bounded input holds these plants from here: every plan ends beyond measure.
+    for a, far in ((1.5, 5.0), (2.0, 0.9), (2.0, 50.0)):
+        plant = LinearSystem([[a, 0.5], [0, 1.1]], [[0], [1]], dt=0.1, u_min=-1, u_max=1)
+        answer = kind(plant, QuadraticCost(np.eye(2), [[0.1]]), 60).solve([far, 0.0])
+        assert answer.status == "failed"
+        assert "always leave a plan" in answer.message
+        assert np.isnan(answer.u).all()
+
+
 @pytest.mark.parametrize("status", [0, 1, 2, 3, 4])
 def test_a_row_is_left_out_only_if_a_program_shows_that_it_may(monkeypatch, status):
     unstable = LinearSystem([[2.0]], [[1.0]], dt=1, u_min=-1, u_max=1)

@@ -98,6 +98,8 @@ class ConvexMPC(Controller):
         end = last if isinstance(last, Polyhedron) else None
         self._rows = FixedRows(system, self.horizon, constraints, end)
         self._cones = [FixedCone(system, self.horizon, cone) for cone in output_cones]
+        sets = constraints, last, point
+        self._limited = bool(self._cones) or any(part is not None for part in sets)
         weighing = weights(cost, system.nx, system.nu)
         self._units = cost_units(system.A, system.B, *weighing, final=final, steps=self.horizon)
         self._build(constraints, output_cones, final, last, point)
@@ -163,4 +165,5 @@ class ConvexMPC(Controller):
         if self._aside:
             states = states + self._drift @ (state / dx)
         plan = states * dx, inputs * du
-        return mpc_solution(self.system, state, plan, found.objective, found, began)
+        cost, limited = found.objective, self._limited
+        return mpc_solution(self.system, state, plan, cost, found, began, limited=limited)

@@ -92,6 +92,7 @@ class LinearMPC(Controller):
         final, last = terminal_set(terminal, system.nx)
         assert not isinstance(last, Ellipsoid)
         self._ingredients = final is not None
+        self._limited = constraints is not None or last is not None
         weights = np.asarray(cost.Q), np.asarray(cost.R)
         self._program = StageProgram(system, weights, self.horizon, constraints, last, final)
         self._lock = threading.Lock()
@@ -129,7 +130,13 @@ class LinearMPC(Controller):
             plan = plan + bounds.origin
         states, inputs = program.split(plan)
         solution = mpc_solution(
-            self.system, x0, (states * program.dx, inputs * program.du), cost, found, began
+            self.system,
+            x0,
+            (states * program.dx, inputs * program.du),
+            cost,
+            found,
+            began,
+            limited=self._limited,
         )
         return with_reference(solution, reference)
 

@@ -171,15 +171,25 @@ def mpc_solution(
     cost: float,
     found: Any,
     began: float,
+    *,
+    limited: bool,
 ) -> MPCSolution:
     """Return the answer of a controller: the plan, or NaN and the reason why there is none.
 
     ``plan`` is the states and inputs; ``found`` has status, message, iterations and residual.
+    ``limited`` says whether there is more to keep to than input bounds.
     """
-    message, (states, inputs) = found.message, plan
-    if found.status == "infeasible":
+    status, message, (states, inputs) = found.status, found.message, plan
+    if status == "infeasible" and limited:
         message = infeasible_message(x0, len(inputs))
-    if found.status != "solved":
+    elif status == "infeasible":
+        # A solver's proof rules out the plans of moderate size only.
+        status = "failed"
+        message = (
+            "input bounds alone always leave a plan, but here every one leads so far out that "
+            "float64 cannot tell the best"
+        )
+    if status != "solved":
         states, inputs = np.full_like(states, np.nan), np.full_like(inputs, np.nan)
         cost = np.nan
     inputs = np.clip(inputs, system.u_min, system.u_max)
@@ -187,7 +197,7 @@ def mpc_solution(
         u=inputs[0],
         trajectory=predicted(system, states, inputs),
         cost=cost,
-        status=found.status,
+        status=status,
         message=message,
         iterations=found.iterations,
         residual=found.residual,
