@@ -85,20 +85,20 @@ def solve(problem: CondensedProblem, x0: Any, tol: Any, *, start: Any = None) ->
     data, impossible = _data(problem, x0)
     dead = ~jnp.isfinite(data.free).all(-1) | impossible
     start = jnp.zeros_like(data.free) if start is None else start
-    none, still = jnp.zeros_like(data.free), jnp.zeros((*dead.shape, n))
+    none, still, no = jnp.zeros_like(data.free), jnp.zeros((*dead.shape, n)), jnp.zeros_like(dead)
     error = _error(data, none, data.free, jnp.ones(dead.shape))
     found = _judged(data, still, none, data.free, error, n, jnp.zeros(dead.shape, int), tol)
     if problem.fixed is None:
         found = _active_set(problem, data, start, found, dead, tol)
     ended = jax.lax.cond(
         jnp.all(found.done | dead),
-        lambda found: (found, dead & False, dead & False),
+        lambda found: (found, no, no),
         lambda found: _left_over(problem, data, start, found, dead, tol),
         found,
     )
     found, infeasible, limited = ended
     if problem.fixed is None:  # input bounds alone always leave a plan, however bad
-        infeasible = dead & False
+        infeasible = no
     low, high = problem.bounds[:, :1], problem.bounds[:, 1:]
     pull = found.multipliers[..., :n]
     U = jnp.clip(found.rows[..., :n] * problem.scale[:, None], low, high)
@@ -144,7 +144,8 @@ def _judged(
     some = (error > 0) & (unit > 0)
     residual = jnp.where(some, error / jnp.where(some, unit, 1.0), error)
     # XLA's max passes over NaN: what is not finite would look exact.
-    sound = jnp.isfinite(rows).all(-1) & jnp.isfinite(multipliers).all(-1) & jnp.isfinite(error)
+    parts = w, multipliers, rows, error[..., None]
+    sound = jnp.all(jnp.stack([jnp.isfinite(part).all(-1) for part in parts]), axis=0)
     residual = jnp.where(sound, residual, jnp.inf)
     done = residual <= jnp.maximum(tol, FINEST)
     return _Search(w, multipliers, rows, residual, done, count)
@@ -290,15 +291,10 @@ def _left_over(
         lane = jax.lax.dynamic_slice(order, (i,), (chunk,))
         skip = i + jnp.arange(chunk) >= left
         mine, before = jax.tree.map(lambda a: a[lane], one_row)
-        own = lane // k
-        dual = dual_method(
-            problem.Y, own, problem.order[0], mine.free, mine.lower, mine.upper, skip
-        )
-        w, multipliers = dual.w, dual.multipliers
-        moved = w @ problem.Y[0].T if c == 1 else jnp.einsum("bmn,bn->bm", problem.Y[own], w)
+        limits = mine.lower, mine.upper
+        dual = dual_method(problem.Y, lane // k, problem.order[0], mine.free, *limits, skip)
         count = before.iterations + dual.count
-        rows = mine.free + moved
-        new = _judged(mine, w, multipliers, rows, dual.error, n, count, tol)
+        new = _judged(mine, dual.w, dual.multipliers, dual.rows, dual.error, n, count, tol)
         # Two methods have tried: what was found last is kept if it is the better one.
         new = _kept(~(new.residual < before.residual), before, new)
         place = jnp.where(skip, lanes, lane)  # out of bounds: dropped

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from prefmpc.models.quadratic import QuadraticCost
-from prefmpc.mpc._limits import MOVES, input_size
+from prefmpc.mpc._limits import MOVES, input_size, unmoved
 from prefmpc.systems.linear import LinearSystem
 
 
@@ -109,11 +109,11 @@ def condense(
         Hx, Hu = rows.stage[:, : system.nx], rows.stage[:, system.nx :]
         limits.append(jnp.tile(rows.stage_limit, horizon))
         states.append(jnp.tile(Hx, (horizon, 1)))
-        still.append(_unmoved(system, Hx, Hu, horizon).ravel())
+        still.append(unmoved(system.A, system.B, Hx, Hu, horizon).ravel())
     if rows.last is not None:
         limits.append(rows.last_limit)
         states.append(rows.last)
-        still.append(_unmoved(system, rows.last, None, horizon + 1)[-1])
+        still.append(unmoved(system.A, system.B, rows.last, None, horizon + 1)[-1])
     if not limits:
         return _normalised(Y, E, lower, upper, jnp.zeros(len(Y)), None, law)
     left = horizon - np.arange(horizon)
@@ -172,20 +172,6 @@ def _responses(system: LinearSystem, law: Law, sets: Sets) -> tuple[Any, Any]:
         parts.append(sets.last @ last)
     both = jnp.concatenate(parts)
     return both[:, :n], both[:, n:]
-
-
-def _unmoved(system: LinearSystem, Hx: Any, Hu: Any, stages: int) -> Any:
-    """Do what `prefmpc.mpc._limits.unmoved` does, inside of a compiled program."""
-    A, B = system.A, system.B
-
-    def step(carry: tuple[Any, Any, Any], _: None) -> tuple[tuple[Any, Any, Any], Any]:
-        blind, row, size = carry
-        moves = (jnp.abs(row @ B) > MOVES * (size @ jnp.abs(B))).any(axis=1)
-        return (blind & ~moves, row @ A, size @ jnp.abs(A)), blind
-
-    blind = jnp.ones(len(Hx), bool) if Hu is None else ~(jnp.asarray(Hu) != 0).any(axis=1)
-    start = blind, jnp.asarray(Hx), jnp.abs(jnp.asarray(Hx))
-    return jax.lax.scan(step, start, None, length=stages)[1]
 
 
 def scaled(

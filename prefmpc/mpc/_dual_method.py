@@ -38,10 +38,11 @@ ROUNDS = 3
 
 
 class Dual(NamedTuple):
-    """w (b, n) and multipliers (b, m); the largest error of one of the first n rows; verdicts."""
+    """w (b, n), multipliers and rows (b, m); the largest error of one of the first n; verdicts."""
 
     w: Any
     multipliers: Any
+    rows: Any
     error: Any
     infeasible: Any
     limited: Any
@@ -146,8 +147,9 @@ def dual_method(
     place = jnp.where(end.row >= 0, end.row, m)
     multipliers = jnp.zeros((b, m + 1)).at[jnp.arange(b)[:, None], place].add(end.sign * end.force)
     limited = ~end.done | (end.count >= limit)
-    error = _error(g, end)
-    return Dual(end.w, multipliers[:, :m], error, end.infeasible, limited, end.count)
+    rows = _rows_of(g, end.w)
+    error = _error(g, end, rows)
+    return Dual(end.w, multipliers[:, :m], rows, error, end.infeasible, limited, end.count)
 
 
 class _Row(NamedTuple):
@@ -277,7 +279,7 @@ def _afresh(s: _State) -> _State:
     return s._replace(w=w, force=force)
 
 
-def _error(g: _Given, end: _State) -> Any:
+def _error(g: _Given, end: _State, rows: Any) -> Any:
     """Estimate the largest error of one of the first n rows, from what w and λ are, not how.
 
     How far active rows are from their limits, rounding included, moves the other rows by Y N, and
@@ -285,14 +287,12 @@ def _error(g: _Given, end: _State) -> Any:
     the part of w that the active rows do not span, and a row beyond its limits.
     """
     n = g.Y.shape[2]
-    rows, inputs = _rows_of(g, end.w), g.Y[:, :n]
+    inputs = g.Y[:, :n]
     radius = jnp.linalg.norm(end.w, axis=-1)[:, None]
     held = end.row >= 0
     miss = jnp.abs(_of(end.C, end.w) - end.target)
     miss = jnp.where(held, miss + ROUNDING * (jnp.abs(end.target) + radius), 0.0)
-    spread = jnp.abs(
-        jnp.einsum("...in,bjn->bij" if inputs.ndim == 2 else "bin,bjn->bij", inputs, end.N)
-    )
+    spread = jnp.abs(inputs @ end.N.swapaxes(1, 2))
     astray = end.w - _back(end.C, _of(end.N, end.w))
     astray = astray - _back(end.C, _of(end.N, astray))
     aside = jnp.abs(inputs @ astray[..., None])[..., 0]
