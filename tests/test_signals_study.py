@@ -14,11 +14,11 @@ from prefmpc import (
     oscillating_masses,
     random_states,
     select,
-    simulate,
 )
 from prefmpc._random import generator
 from studies import QUADRATIC_Q, QUADRATIC_R, RADIUS, read_spread
 from studies.__main__ import BOOK
+from studies.condensed import condensed_weights, learned_weights, plans, trajectory_rows
 from studies.signals import (
     CASES,
     JERK_LEARNERS,
@@ -27,18 +27,14 @@ from studies.signals import (
     SIGNALS_SIZES,
     TESTS,
     asked,
-    condensed_weights,
     fresh_pairs,
     jerk_cost,
     jerk_person,
     learn,
-    learned_weights,
     loops_of,
     person,
-    plans,
     plant_weights,
     prior_of,
-    trajectory_rows,
 )
 
 MASSES = oscillating_masses()
@@ -52,7 +48,7 @@ def test_rows_give_the_signals_of_a_trajectory(signals):
     T = jax.tree.map(np.asarray, pool[0])
     T = type(T)(T.x, T.u, T.y, u_before=before)
     v = np.concatenate([T.x[0], before, T.u.ravel()])
-    rows = trajectory_rows(MASSES, signals)
+    rows = trajectory_rows(MASSES, signals, 10)
     np.testing.assert_allclose(rows @ v, select(T, signals).x[:-1], atol=1e-12)
     Q, R = np.diag(np.arange(1.0, 1 + rows.shape[1])), np.diag([0.5, 2.0])
     cost = SignalCost(QuadraticCost(Q, R), signals)
@@ -100,14 +96,6 @@ def test_the_plant_s_prior_is_bryson_s_rule_in_other_words():
     direct = np.asarray(QuadraticCost(rule.Q, rule.R)(T))
     view = SignalCost(QuadraticCost(told.Q, told.R), "x0")
     np.testing.assert_allclose(view(T), direct, rtol=1e-4)  # its R is small, not zero
-
-
-def test_the_plant_that_is_left_alone():
-    from studies.signals import left_alone
-
-    x0 = random_states(RADIUS, key=jax.random.key(3005), shape=(2,))
-    run = simulate(MASSES, lambda x: np.zeros(2), x0, 4)
-    np.testing.assert_allclose(left_alone(MASSES, x0, 4).x, run.x, atol=1e-12)
 
 
 def test_the_book_s_numbers_are_what_the_code_gives():

@@ -21,6 +21,7 @@ from prefmpc.preferences.people import by_criterion
 from prefmpc.preferences.pools import lqr_pool, random_states
 from prefmpc.preferences.trajectories import Trajectory
 from prefmpc.systems.linear import LinearSystem, oscillating_masses
+from studies.condensed import responses
 from studies.quadratic import QUADRATIC_HORIZON, RADIUS, ask_in_pairs, stacked_loops
 
 WALL_SIDE, FREE_SIDE, EFFORT = 100.0, 10.0, 0.2
@@ -112,15 +113,6 @@ def constant_system(system: LinearSystem) -> LinearSystem:
 def fit_offset(data: Comparisons) -> QuadraticCost:
     """Learn a quadratic with a centre of its own: σ of (x, 1)."""
     return fit_map(extended(data), bryson(np.append(REACH, 0.3), FORCES)).model
-
-
-def responses(system: LinearSystem, horizon: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return Φ (N, nx, nx) and Γ (N, nx, N·nu): x_k = Φ_k x_0 + Γ_k U."""
-    Phi = np.stack([np.linalg.matrix_power(system.A, k) for k in range(horizon)])
-    Gamma = np.zeros((horizon, system.nx, horizon, system.nu))
-    for k in range(1, horizon):
-        Gamma[k, :, :k] = np.swapaxes(Phi[k - 1 :: -1] @ system.B, 0, 1)
-    return Phi, Gamma.reshape(horizon, system.nx, -1)
 
 
 def person_loops(system: LinearSystem, x0: np.ndarray, steps: int) -> Trajectory:

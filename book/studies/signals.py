@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from prefmpc._random import generator
@@ -15,14 +13,19 @@ from prefmpc.learning.convex import fit_map
 from prefmpc.learning.priors import WishartPrior, bryson
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.models.signals import Signal, SignalCost, select
-from prefmpc.mpc._batched_qp import SOLVED, solve
-from prefmpc.mpc._condensed import CondensedProblem, scaled
 from prefmpc.preferences.comparisons import Comparisons
 from prefmpc.preferences.people import by_criterion
 from prefmpc.preferences.pools import random_states, random_weights
 from prefmpc.preferences.trajectories import Trajectory, phi, rollout
 from prefmpc.systems.linear import LinearSystem, oscillating_masses
-from studies.onesided import FORCES, REACH, responses
+from studies.condensed import (
+    blind_to_before,
+    condensed_weights,
+    learned_weights,
+    trajectory_rows,
+    weight_loops,
+)
+from studies.onesided import FORCES, REACH
 from studies.quadratic import (
     QUADRATIC_HORIZON,
     QUADRATIC_Q,
@@ -72,104 +75,13 @@ JERK = 20.0
 
 JERK_SIZES = (100, 1000, 4000)
 JERK_LEARNERS = ("(X, U)", "(X, ΔU, U)")
-PRECISION = 1e-6
-"""Error of a plan, relative to its largest input, that counts as solved."""
-
-
-def trajectory_rows(
-    system: LinearSystem, signals: Sequence[Signal], horizon: int = N
-) -> np.ndarray:
-    """Return Z (N, n, nx + nu + N·nu): the signals at step k are Z_k (x_0, u_before, U).
-
-    For "x", "y", "du" and "dy", in the order of `prefmpc.select`.
-    """
-    nx, nu = system.nx, system.nu
-    Phi, Gamma = responses(system, horizon)
-    X = np.concatenate([Phi, np.zeros((horizon, nx, nu)), Gamma], axis=2)
-    U = np.eye(nu + horizon * nu).reshape(horizon + 1, nu, -1)
-    U = np.concatenate([np.zeros((horizon + 1, nu, nx)), U], axis=2)
-    Y = system.C @ X
-    known = {"x": X, "y": Y, "du": np.diff(U, axis=0), "dy": np.diff(Y, axis=0, prepend=Y[:1])}
-    return np.concatenate([known[name] for name in signals], axis=1)
-
-
-def condensed_weights(Z: np.ndarray, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """Return W with Σ_k z_kᵀQz_k + u_kᵀRu_k = vᵀWv, for v = (x_0, u_before, U) and z_k = Z_k v."""
-    W = np.einsum("kai,ab,kbj->ij", Z, Q, Z)
-    inputs = len(Z) * len(R)
-    W[-inputs:, -inputs:] += np.kron(np.eye(len(Z)), R)
-    return W
 
 
 def plant_weights(system: LinearSystem, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
     """Return the weights W (26, 26) over (x_0, U) that are σ(X, U) on the plant's trajectories."""
     known = np.r_[: system.nx, system.nx + system.nu : system.nx + (N + 1) * system.nu]
-    W = condensed_weights(trajectory_rows(system, ["x"]), Q, R)
+    W = condensed_weights(trajectory_rows(system, ["x"], N), Q, R)
     return W[np.ix_(known, known)]
-
-
-def learned_weights(cost: QuadraticCost, nx: int) -> np.ndarray:
-    """Return W over (x_0, U) of a quadratic of the view "x0"; its R weighs u_0 once more."""
-    W = np.array(cost.Q)
-    nu = cost.R.shape[-1]
-    W[nx : nx + nu, nx : nx + nu] += cost.R
-    return W
-
-
-def input_problem(W: np.ndarray, n: int, u_max: np.ndarray) -> CondensedProblem:
-    """Return min vᵀWv over abs(U) ≤ u_max for v = (what is given (n,), U): no plant is needed."""
-    upper = np.tile(u_max, (len(W) - n) // len(u_max))
-    return scaled(2 * W[n:, n:], 2 * W[n:, :n], -upper, upper)
-
-
-def plans(W: np.ndarray, given: np.ndarray, system: LinearSystem) -> np.ndarray:
-    """Return the plans U (m, N, nu) that minimise vᵀWv for every row of ``given`` (m, n)."""
-    problem = input_problem(W, given.shape[-1], system.u_max)
-    single = jax.tree.map(lambda leaf: leaf[None], problem)
-    answer = jax.jit(solve)(single, given[None], PRECISION)
-    if not np.all(answer.status == SOLVED):
-        raise RuntimeError("a plan was not solved")
-    return np.asarray(answer.U).reshape(len(given), -1, system.nu)
-
-
-def blind_to_before(W: np.ndarray, system: LinearSystem) -> np.ndarray:
-    """Return weights over (x_0, u_before, U) that are those over (x_0, U): u_before costs 0."""
-    nx, nu = system.nx, system.nu
-    return np.insert(np.insert(W, [nx] * nu, 0.0, axis=0), [nx] * nu, 0.0, axis=1)
-
-
-def weight_loops(
-    system: LinearSystem, weights: Sequence[np.ndarray], x0: np.ndarray, steps: int
-) -> Trajectory:
-    """Return the closed loops (c, m) of several W over (x_0, u_before, U) from x0 (m, nx).
-
-    The input before the first one is 0. Raises a RuntimeError if a problem is not solved.
-    """
-    count = len(weights)
-    filled = [*weights, *[weights[-1]] * (-count % 8)]  # few shapes to compile
-    problems = [input_problem(W, system.nx + system.nu, system.u_max) for W in filled]
-    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *problems)
-    x, u = (np.asarray(part)[:count] for part in _loops(system, stack, x0, steps))
-    if not np.isfinite(u).all():
-        raise RuntimeError("a closed loop met an MPC problem that was not solved")
-    rest = np.zeros((*u.shape[:2], system.nu))
-    return Trajectory(x, u, system.output(x[..., :-1, :]), u_before=rest)
-
-
-@jax.jit(static_argnums=3)
-def _loops(system: LinearSystem, problems: Any, x0: Any, steps: int) -> Any:
-    def step(now: Any, _: None) -> tuple[Any, tuple[Any, Any]]:
-        x, before = now
-        answer = solve(problems, jnp.concatenate([x, before], axis=-1), PRECISION)
-        u = jnp.where((answer.status == SOLVED)[..., None], answer.U[..., : system.nu], jnp.nan)
-        x_next = system.step(x, u)
-        return (x_next, u), (x_next, u)
-
-    count = len(problems.scale)
-    start = jnp.broadcast_to(x0, (count, *x0.shape)), jnp.zeros((count, len(x0), system.nu))
-    _, (x, u) = jax.lax.scan(step, start, None, length=steps)
-    x = jnp.concatenate([start[0][None], x])
-    return jnp.moveaxis(x, 0, 2), jnp.moveaxis(u, 0, 2)
 
 
 def fresh_pairs(
@@ -274,7 +186,7 @@ def loops_of(
         if cost.signals == ("x0",):
             W = blind_to_before(learned_weights(cost.model, system.nx), system)
         else:
-            Z = trajectory_rows(system, cost.signals)
+            Z = trajectory_rows(system, cost.signals, N)
             W = condensed_weights(Z, np.asarray(cost.model.Q), np.asarray(cost.model.R))
         weights.append(W)
     return weight_loops(system, weights, x0, steps)
@@ -283,17 +195,10 @@ def loops_of(
 def signals_case(
     *,
     key: Any,
-    sizes: tuple[int, ...] = SIGNALS_SIZES,
-    learners: tuple[str, ...] = LEARNERS,
     loops: int = 50,
     steps: int = 30,
 ) -> dict[str, np.ndarray]:
     """Learn from each view of the same answers, and control with what was learned.
-
-    Parameters
-    ----------
-    sizes, learners : some of `SIGNALS_SIZES` and of `LEARNERS`
-        What comes of them does not depend on the others.
 
     Returns
     -------
@@ -317,17 +222,17 @@ def signals_case(
         fresh_pairs(500, key=streams[4], inputs="random inputs"),
     ]
     x0 = random_states(RADIUS, key=streams[5], shape=(loops,))
-    share = np.zeros((len(CASES), len(sizes), len(learners), len(TESTS)))
+    share = np.zeros((len(CASES), len(SIGNALS_SIZES), len(LEARNERS), len(TESTS)))
     lost = np.zeros(share.shape[:-1])
     alone = np.zeros((len(CASES), len(ALONE)))
     alone_share = np.zeros((len(CASES), 2, len(TESTS)))
     for c, (source, who) in enumerate(CASES):
-        data = {n: asked(pools[source][: 2 * n], person(who)) for n in sizes}
+        data = {n: asked(pools[source][: 2 * n], person(who)) for n in SIGNALS_SIZES}
         checks = [asked(test, person(who)) for test in tests]
-        costs = [learn(name, data[n]) for n in sizes for name in learners]
+        costs = [learn(name, data[n]) for n in SIGNALS_SIZES for name in LEARNERS]
         share[c] = _shares(costs, checks).reshape(share[c].shape)
         known, rules = QuadraticCost(PEOPLE[who], QUADRATIC_R), alone_rules(system)
-        free = left_alone(system, x0, steps)
+        free = rollout(system, x0, np.zeros((system.nu, system.nx)), steps)
         values = [*person(who)(loops_of(system, costs, x0, steps)), person(who)(free)]
         direct = stacked_loops(system, [known, *rules], x0, horizon=N, steps=steps)
         best, *by_rule = person(who)(direct).mean(axis=1)
@@ -351,14 +256,6 @@ def alone_rules(system: LinearSystem) -> list[QuadraticCost]:
     rule = bryson(REACH, FORCES)
     ny = system.ny
     return [QuadraticCost(Q, rule.R) for Q in (rule.Q, system.C.T @ rule.Q[:ny, :ny] @ system.C)]
-
-
-def left_alone(system: LinearSystem, x0: np.ndarray, steps: int) -> Trajectory:
-    """Return the trajectories (m,) of the plant that is left alone."""
-    x = [x0]
-    for _ in range(steps):
-        x.append(x[-1] @ system.A.T)
-    return Trajectory(np.stack(x, axis=1), np.zeros((len(x0), steps, system.nu)))
 
 
 def _jerk(
