@@ -26,7 +26,7 @@ from studies.quadratic import QUADRATIC_HORIZON, RADIUS, ask_in_pairs, stacked_l
 
 WALL_SIDE, FREE_SIDE, EFFORT = 100.0, 10.0, 0.2
 REACH = np.array([0.3, 0.3, 0.3, 1.0, 1.0, 1.0])
-"""What the states of the swinging masses reach, in m and m/s: for Bryson's rule."""
+"""What the states of the swinging masses reach, in m and m/s, for Bryson's rule."""
 
 FORCES = np.array([1.0, 1.0])
 

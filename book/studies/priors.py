@@ -47,7 +47,7 @@ PEOPLE = ("sure", "unsure", "coupled")
 who also dislikes distances between neighbouring masses, so that Q is not diagonal."""
 
 FORCE_MAX = np.array([1.0, 1.0])
-"""N: what the plant's bounds say, and with `RADIUS` all that Bryson's prior is made of."""
+"""In newtons, what the plant's bounds say, and with `RADIUS` all that Bryson's prior is made of."""
 
 SCALES = (0.01, 0.1, 1.0, 10.0, 100.0)
 STRENGTHS = (0.1, 1.0, 10.0)
@@ -148,7 +148,7 @@ LEVELS = (0.5, 0.8, 0.9, 0.95)
 ASKED = (20, 100)
 METHODS = ("samples", "Laplace")
 PERSON_SCALE = 1e-3
-"""Of the prior that people are drawn from: small, so that they often cannot say."""
+"""Of the prior that people are drawn from; small, so that they often cannot say."""
 
 
 CASES = ("drawn from the prior", "the person of case study 1")

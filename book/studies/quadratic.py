@@ -21,7 +21,7 @@ from prefmpc.preferences.trajectories import Trajectory, phi
 from prefmpc.systems.linear import LinearSystem, oscillating_masses
 
 RADIUS = np.array([0.3, 0.3, 0.3, 0.05, 0.05, 0.05])
-"""Half-widths of the uniform distribution of x(0): metres, then metres per second."""
+"""Half-widths of the uniform distribution of x(0) in metres, then in metres per second."""
 
 QUADRATIC_Q = np.diag([40.0, 40.0, 40.0, 5.0, 5.0, 5.0])
 QUADRATIC_R = np.diag([0.2, 0.2])

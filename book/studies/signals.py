@@ -59,13 +59,13 @@ ALONE = ("Bryson's rule", "Bryson's rule for outputs", "no input")
 """Controllers that ask nobody."""
 
 SHARP = 10.0
-"""Scale of all priors but one: a signal at its limit costs ten units of log-odds in each step."""
+"""Scale of all priors but one; a signal at its limit costs ten units of log-odds in each step."""
 
 NAIVE_SCALE, NAIVE_STRENGTH = 100.0, 0.1
-"""Of the prior of (x₀, U) without the plant: the best of eight on draws that are not reported."""
+"""Of the prior of (x₀, U) without the plant, the best of eight on draws that are not reported."""
 
 SMALL = 1e-4
-"""R of the view (x₀, U): its input u_0 is one of its states too, and is weighed there."""
+"""R of the view (x₀, U); its input u_0 is one of its states too, and is weighed there."""
 
 GAINS = 500
 """Random LQR controllers that the trajectories of one pool are made with."""
