@@ -34,14 +34,14 @@ BAND = 0.3
 """In the lane from the moment on from which the car stays this near to its centre, in m."""
 
 EASY_ACCELERATION, EASY_JERK, PATIENCE = 1.5, 2.5, 2.0
-"""What costs the passenger one unit, peaks in m/s² and m/s³, and waiting in s."""
+"""What costs the passenger one unit (peaks in m/s² and m/s³, waiting in s)."""
 
 LATERAL_LIMIT = 4.0
 """Largest lateral acceleration in m/s², for the tyres."""
 
 SIGNALS = ("y", "dy")
 SCALE = np.array([2.0, 0.05, 0.5, 1.0, 0.15, 0.0066, 0.2, 0.1, 0.012, 1.0])
-"""Sizes of y, Δy and u, in this order; position, heading, lateral acceleration, speed; steering, throttle."""
+"""Sizes of y, Δy and u (position, heading, lateral acceleration, speed; steering, throttle)."""
 
 LANE_SIGNALS = (
     *("position", "heading", "lateral acceleration", "speed"),

@@ -27,9 +27,9 @@ HORIZONS = {"pendulum": 5, "masses": 10}
 JUDGED, ANSWERS = 10, 100
 """Steps of the trajectories that people judge, and the number of their answers."""
 REGRET_HORIZON, REGRET_STEPS = 10, 60
-"""For what the person loses, an N with which both plants are stable without ingredients as well."""
+"""For what the person loses, with an N for which both plants are stable without ingredients."""
 PENDULUM_RADIUS = np.array([0.2, 0.5])
-"""x(0) of the pendulum, angle in rad, angular velocity in rad/s."""
+"""x(0) of the pendulum (angle in rad, angular velocity in rad/s)."""
 PENDULUM_Q, PENDULUM_R = np.diag([1.0, 0.01]), np.diag([10.0])
 """A person who likes gentle torques."""
 PEOPLE = {"pendulum": (PENDULUM_Q, PENDULUM_R), "masses": (QUADRATIC_Q, QUADRATIC_R)}
