@@ -17,15 +17,8 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import (
-    choice,
-    function,
-    instance,
-    nonnegative,
-    positive,
-    psd_matrix,
-    real_array,
-)
+from prefmpc._checks import choice, function, instance, nonnegative, positive, real_array
+from prefmpc._matrices import psd_matrix
 from prefmpc.preferences.trajectories import Trajectory, failed, max_input, phi, settling_time
 
 Preference = Callable[[Trajectory, Trajectory], Any]

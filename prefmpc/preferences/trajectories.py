@@ -20,12 +20,13 @@ from prefmpc._checks import (
     is_traced,
     nonnegative,
     positive_int,
-    psd_matrix,
     real_array,
     shaped,
     single,
     to_numpy,
+    traced,
 )
+from prefmpc._matrices import psd_matrix
 from prefmpc._pytree import Stack, bypass_init, register_pytree
 from prefmpc.systems.linear import LinearSystem, System
 
@@ -272,17 +273,17 @@ def rollout(
     steps = positive_int("steps", steps)
     batch = starts.shape[:-1]
     flat = starts.reshape(-1, system.nx)
+    saturate, gains = flag("saturate", saturate), None
     if callable(law):
         function("law", law, 1)
-        x, u = _rollout_law(system, flat, steps, law, flag("saturate", saturate))
     else:
         K = shaped("law", finite_array("law", law), (system.nu, system.nx), "a gain K")
         if K.shape[:-2] not in ((), batch):
             raise ValueError(f"law must hold one gain or one for each x0 {batch}, got {K.shape}")
         gains = array_module(K).broadcast_to(K, (*batch, system.nu, system.nx))
-        gains = gains.reshape(-1, system.nu, system.nx)
-        x, u = _rollout_gain(system, flat, steps, gains, flag("saturate", saturate))
-    x, u = to_numpy((x, u))
+        gains, law = gains.reshape(-1, system.nu, system.nx), _feedback
+    with traced("law(x)"):
+        x, u = to_numpy(_rollout(system, flat, steps, law, gains, saturate))
     if not isinstance(system, LinearSystem) and not is_traced(x):
         check_finite_states(x)
     return from_flat(system, x, u, batch)
@@ -308,31 +309,27 @@ def from_flat(system: System, x: Any, u: Any, batch: tuple[int, ...]) -> Traject
     return bypass_init(Trajectory, x=x, u=u, y=system.output(x[..., :-1, :]))
 
 
-def _scan(
-    system: System, x0: Any, steps: int, law: Callable[[Any], Any], saturate: bool
-) -> tuple[Any, Any]:
-    def step(x: Any, _: None) -> tuple[Any, tuple[Any, Any]]:
-        u = real_array("what law returns", law(x))
-        if u.shape != (system.nu,):
-            raise ValueError(f"law must return shape ({system.nu},), got {u.shape}")
-        if saturate:
-            u = jnp.clip(u, system.u_min, system.u_max)
-        x_next = system.step(x, u)
-        return x_next, (x_next, u)
-
-    _, (x, u) = jax.lax.scan(step, x0, None, length=steps)
-    return jnp.concatenate([x0[None], x]), u
+def _feedback(x: Any, K: Any) -> Any:
+    return -K @ x
 
 
-@jax.jit(static_argnums=(2, 3, 4))
-def _rollout_law(
-    system: System, x0: Any, steps: int, law: Callable[[Any], Any], saturate: bool
+@jax.jit(static_argnums=(2, 3, 5))
+def _rollout(
+    system: System, x0: Any, steps: int, law: Callable[..., Any], gains: Any, saturate: bool
 ) -> Any:
-    return jax.vmap(lambda start: _scan(system, start, steps, law, saturate))(x0)
+    """Return x (m, steps + 1, nx) and u (m, steps, nu) under law(x), or law(x, K) with gains."""
 
+    def run(start: Any, gain: Any) -> tuple[Any, Any]:
+        def step(x: Any, _: None) -> tuple[Any, tuple[Any, Any]]:
+            u = real_array("what law returns", law(x) if gain is None else law(x, gain))
+            if u.shape != (system.nu,):
+                raise ValueError(f"law must return shape ({system.nu},), got {u.shape}")
+            if saturate:
+                u = jnp.clip(u, system.u_min, system.u_max)
+            x_next = system.step(x, u)
+            return x_next, (x_next, u)
 
-@jax.jit(static_argnums=(2, 4))
-def _rollout_gain(system: System, x0: Any, steps: int, K: Any, saturate: bool) -> Any:
-    return jax.vmap(lambda start, gain: _scan(system, start, steps, lambda x: -gain @ x, saturate))(
-        x0, K
-    )
+        _, (x, u) = jax.lax.scan(step, start, None, length=steps)
+        return jnp.concatenate([start[None], x]), u
+
+    return jax.vmap(run)(x0, gains)

@@ -11,15 +11,8 @@ import numpy as np
 import scipy.linalg
 from jax.typing import ArrayLike
 
-from prefmpc._checks import (
-    bounds_pair,
-    finite_array,
-    instances,
-    nonnegative,
-    psd_matrix,
-    sample_time,
-    single,
-)
+from prefmpc._checks import bounds_pair, finite_array, instances, nonnegative, sample_time, single
+from prefmpc._matrices import psd_matrix
 from prefmpc._pytree import Stack, register_pytree
 from prefmpc._units import cost_units
 

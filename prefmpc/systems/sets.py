@@ -7,15 +7,8 @@ import dataclasses
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import (
-    bounds_pair,
-    finite,
-    finite_array,
-    nonnegative,
-    positive,
-    psd_matrix,
-    shaped,
-)
+from prefmpc._checks import bounds_pair, finite_array, nonnegative, positive, shaped
+from prefmpc._matrices import psd_matrix
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
@@ -158,7 +151,7 @@ class SecondOrderCone:
             if vector.shape != (size,):
                 raise ValueError(f"{name} must have shape ({size},), got {vector.shape}")
             object.__setattr__(self, name, vector)
-        object.__setattr__(self, "d", finite("d", d))
+        object.__setattr__(self, "d", float(finite_array("d", d, ndim=0)))
 
     @property
     def dim(self) -> int:
