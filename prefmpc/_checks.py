@@ -18,7 +18,7 @@ LARGEST_INT = 2**31 - 1
 """Of whole numbers: compiled loops count with 32 bits."""
 
 IN_JAX = (
-    " Write it in jax.numpy: jnp.sin for np.sin or math.sin, jnp.stack for np.array, "
+    ". Write it in jax.numpy: jnp.sin for np.sin or math.sin, jnp.stack for np.array, "
     "jnp.where for if, x.at[i].set(...) for x[i] = ..."
 )
 
@@ -153,7 +153,7 @@ def traced(name: str, kinds: type[Exception] = jax.errors.JAXTypeError) -> Itera
     except kinds as error:
         causes = error, error.__cause__, error.__context__
         untraceable = any(isinstance(cause, jax.errors.JAXTypeError) for cause in causes)
-        said = str(error).partition("\n")[0] + (IN_JAX if untraceable else "")
+        said = str(error).partition("\n")[0].rstrip(".") + (IN_JAX if untraceable else "")
         raise ValueError(f"{name} must work on JAX arrays, but raised: {said}") from error
 
 

@@ -273,17 +273,18 @@ def rollout(
     steps = positive_int("steps", steps)
     batch = starts.shape[:-1]
     flat = starts.reshape(-1, system.nx)
-    saturate, gains = flag("saturate", saturate), None
+    gains = None
     if callable(law):
         function("law", law, 1)
+        feedback: Callable[..., Any] = law
     else:
         K = shaped("law", finite_array("law", law), (system.nu, system.nx), "a gain K")
         if K.shape[:-2] not in ((), batch):
             raise ValueError(f"law must hold one gain or one for each x0 {batch}, got {K.shape}")
         gains = array_module(K).broadcast_to(K, (*batch, system.nu, system.nx))
-        gains, law = gains.reshape(-1, system.nu, system.nx), _feedback
+        gains, feedback = gains.reshape(-1, system.nu, system.nx), _feedback
     with traced("law(x)"):
-        x, u = to_numpy(_rollout(system, flat, steps, law, gains, saturate))
+        x, u = to_numpy(_rollout(system, flat, steps, feedback, gains, flag("saturate", saturate)))
     if not isinstance(system, LinearSystem) and not is_traced(x):
         check_finite_states(x)
     return from_flat(system, x, u, batch)

@@ -11,7 +11,15 @@ import numpy as np
 import scipy.linalg
 from jax.typing import ArrayLike
 
-from prefmpc._checks import bounds_pair, finite_array, instances, nonnegative, sample_time, single
+from prefmpc._checks import (
+    bounds_pair,
+    finite_array,
+    instances,
+    nonnegative,
+    real_array,
+    sample_time,
+    single,
+)
 from prefmpc._matrices import psd_matrix
 from prefmpc._pytree import Stack, register_pytree
 from prefmpc._units import cost_units
@@ -92,11 +100,12 @@ class LinearSystem(System, Stack):
 
     def step(self, x: Any, u: Any) -> Any:
         """Return x⁺ = A x + B u, shape (..., nx)."""
+        x, u = real_array("x", x), real_array("u", u)
         return x @ self.A.swapaxes(-1, -2) + u @ self.B.swapaxes(-1, -2)
 
     def output(self, x: Any) -> Any:
         """Return y = C x, shape (..., ny)."""
-        return x @ self.C.swapaxes(-1, -2)
+        return real_array("x", x) @ self.C.swapaxes(-1, -2)
 
     @classmethod
     def stack(cls, systems: Sequence[LinearSystem]) -> LinearSystem:

@@ -150,7 +150,7 @@ def traced_shape(name: str, call: Callable[..., Any], *sizes: int) -> tuple[int,
     function(name.partition("(")[0], call, len(sizes))
     vectors = (jax.ShapeDtypeStruct((size,), np.float64) for size in sizes)
     with traced(name, Exception):
-        out = jax.eval_shape(call, *vectors)
+        out = jax.eval_shape(lambda *given: call(*given), *vectors)  # JAX takes no ufunc
     if not hasattr(out, "shape"):
         raise ValueError(f"{name} must return one array, got {type(out).__name__}")
     return tuple(out.shape)
