@@ -17,6 +17,8 @@ from prefmpc.preferences.people import Preference, asked, failed_loses
 from prefmpc.preferences.trajectories import Trajectory, failed, from_flat
 from prefmpc.systems.linear import System
 
+__all__ = ["WinRate", "accuracy", "regret", "simulate", "win_rate"]
+
 SAME_START = 1e-9
 """So far apart two states may be to count as the same, relative to the largest on the way."""
 
