@@ -27,7 +27,7 @@ from prefmpc._checks import (
     traced,
 )
 from prefmpc._matrices import psd_matrix
-from prefmpc._pytree import Stack, bypass_init, register_pytree
+from prefmpc._pytree import Stack, bypass_init, register_pytree, set_fields
 from prefmpc.systems.linear import LinearSystem, System
 
 
@@ -107,8 +107,7 @@ class Trajectory(Stack):
         for name, value in {"x_r": x_r, "u_r": u_r, "y_r": y_r, "u_before": u_before}.items():
             if value is not None:
                 values[name] = _reference(name, value, values[name[0]])
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        set_fields(self, **values)
 
     def deviation(self) -> Trajectory:
         """Return the same trajectory as deviations from its set point, which is then zero.
@@ -147,6 +146,15 @@ def failed(trajectory: Trajectory) -> np.ndarray:
     """Say which trajectories (...) hold NaN or infinite values: closed loops that failed."""
     parts = (trajectory.x, trajectory.u, trajectory.y)
     return ~np.all([np.isfinite(np.asarray(part)).all((-2, -1)) for part in parts], axis=0)
+
+
+def check_finite(name: str, trajectories: Trajectory, note: str) -> None:
+    """Raise a ValueError if a trajectory holds NaN or infinite values."""
+    if (bad := failed(trajectories)).any():
+        raise ValueError(
+            f"{name} must be finite, got {int(bad.sum())} of {bad.size} with NaN or infinite "
+            f"values ({note}), the first at index {int(np.argmax(bad))}"
+        )
 
 
 def _reference(name: str, value: ArrayLike, signal: Any) -> Any:

@@ -21,7 +21,7 @@ from prefmpc._checks import (
     single,
 )
 from prefmpc._matrices import psd_matrix
-from prefmpc._pytree import Stack, register_pytree
+from prefmpc._pytree import Stack, register_pytree, set_fields
 from prefmpc._units import cost_units
 
 if TYPE_CHECKING:
@@ -92,11 +92,8 @@ class LinearSystem(System, Stack):
         u_max: ArrayLike | None = None,
     ) -> None:
         a, b, c = _state_space(A, B, C)
-        dt = sample_time(dt)
         low, high = bounds_pair(("u_min", "u_max"), u_min, u_max, b.shape[1])
-        values = {"A": a, "B": b, "C": c, "u_min": low, "u_max": high, "dt": dt}
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        set_fields(self, A=a, B=b, C=c, u_min=low, u_max=high, dt=sample_time(dt))
 
     def step(self, x: Any, u: Any) -> Any:
         """Return x⁺ = A x + B u, shape (..., nx)."""
@@ -195,21 +192,17 @@ class LinearSystem(System, Stack):
             )
         if np.any(np.asarray(system.D)):
             raise ValueError(f"system must have D = 0 (the output is y = C x), got D = {system.D}")
-        if system.isctime(strict=True) or system.dt == 0:
-            if dt is None:
-                raise ValueError("dt must be given for a continuous-time system, got None")
-            return cls.from_continuous(
-                system.A, system.B, system.C, dt=dt, u_min=u_min, u_max=u_max
-            )
-        unknown = system.dt is None or system.dt is True
-        own = None if unknown else float(system.dt)
-        if own is None and dt is None:
-            raise ValueError(f"dt must be given: the system's own sample time is {system.dt!r}")
-        if own is not None and dt is not None and not np.isclose(own, sample_time(dt), atol=0):
-            raise ValueError(f"dt must equal the system's own sample time {own}, got {dt}")
-        chosen = own if own is not None else dt
-        assert chosen is not None
-        return cls(system.A, system.B, system.C, dt=chosen, u_min=u_min, u_max=u_max)
+        continuous = system.isctime(strict=True) or system.dt == 0
+        if not (continuous or system.dt is None or system.dt is True):
+            own = float(system.dt)
+            if dt is not None and not np.isclose(own, sample_time(dt), atol=0):
+                raise ValueError(f"dt must equal the system's own sample time {own}, got {dt}")
+            dt = own
+        if dt is None:
+            kind = "continuous-time" if continuous else "discrete-time"
+            raise ValueError(f"dt must be given for a {kind} system without its own, got None")
+        make = cls.from_continuous if continuous else cls
+        return make(system.A, system.B, system.C, dt=dt, u_min=u_min, u_max=u_max)
 
     def to_control(self) -> control.StateSpace:
         """Return the same plant as a python-control ``StateSpace`` (without the input bounds)."""

@@ -22,7 +22,7 @@ from prefmpc._checks import (
     to_numpy,
     traced,
 )
-from prefmpc._pytree import register_pytree
+from prefmpc._pytree import register_pytree, set_fields
 from prefmpc.systems.linear import LinearSystem, System
 
 Dynamics = Callable[[Any, Any], Any]
@@ -74,7 +74,6 @@ class NonlinearSystem(System):
         u_max: ArrayLike | None = None,
     ) -> None:
         nx, nu = positive_int("nx", nx), positive_int("nu", nu)
-        dt = sample_time(dt)
         output = _state_itself if g is None else g
         low, high = bounds_pair(("u_min", "u_max"), u_min, u_max, nu)
         if (got := traced_shape("f(x, u)", f, nx, nu)) != (nx,):
@@ -82,9 +81,8 @@ class NonlinearSystem(System):
         ny = traced_shape("g(x)", output, nx)
         if len(ny) != 1 or not ny[0]:
             raise ValueError(f"g must return an output of shape (ny,), got shape {ny}")
-        values = {"f": f, "g": output, "u_min": low, "u_max": high, "dt": dt}
-        for name, value in {**values, "nx": nx, "nu": nu, "ny": int(ny[0])}.items():
-            object.__setattr__(self, name, value)
+        sizes = {"nx": nx, "nu": nu, "ny": int(ny[0])}
+        set_fields(self, f=f, g=output, u_min=low, u_max=high, dt=sample_time(dt), **sizes)
 
     @classmethod
     def from_continuous(
