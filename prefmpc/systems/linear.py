@@ -32,7 +32,11 @@ RICCATI = 1e-8
 
 
 class System:
-    """A discrete-time plant x⁺ = f(x, u), y = g(x) with input bounds; see its two kinds."""
+    """A discrete-time plant x⁺ = f(x, u), y = g(x) with input bounds; see its two kinds.
+
+    It has nx states, nu inputs and ny outputs, a sample time ``dt`` in seconds, and limits
+    u_min, u_max (nu,) in the unit of the input, ±inf where there are none.
+    """
 
     nx: int
     nu: int
@@ -80,6 +84,9 @@ class LinearSystem(System, Stack):
     u_min: np.ndarray
     u_max: np.ndarray
     dt: float
+    nx: int
+    nu: int
+    ny: int
 
     def __init__(
         self,
@@ -93,7 +100,8 @@ class LinearSystem(System, Stack):
     ) -> None:
         a, b, c = _state_space(A, B, C)
         low, high = bounds_pair(("u_min", "u_max"), u_min, u_max, b.shape[1])
-        set_fields(self, A=a, B=b, C=c, u_min=low, u_max=high, dt=sample_time(dt))
+        sizes = {"nx": len(a), "nu": b.shape[1], "ny": len(c)}
+        set_fields(self, A=a, B=b, C=c, u_min=low, u_max=high, dt=sample_time(dt), **sizes)
 
     def step(self, x: Any, u: Any) -> Any:
         """Return x⁺ = A x + B u, shape (..., nx)."""
@@ -129,21 +137,6 @@ class LinearSystem(System, Stack):
         if not self.batch_shape:
             raise TypeError("a single plant has no length")
         return self.batch_shape[0]
-
-    @property
-    def nx(self) -> int:  # type: ignore[override]
-        """Number of states."""
-        return int(self.A.shape[-1])
-
-    @property
-    def nu(self) -> int:  # type: ignore[override]
-        """Number of inputs."""
-        return int(self.B.shape[-1])
-
-    @property
-    def ny(self) -> int:  # type: ignore[override]
-        """Number of outputs."""
-        return int(self.C.shape[-2])
 
     @classmethod
     def from_continuous(
@@ -249,7 +242,7 @@ class LinearSystem(System, Stack):
         return K * du[:, None] / dx, P / dx / dx[:, None]
 
 
-register_pytree(LinearSystem, static=("dt",))
+register_pytree(LinearSystem, static=("dt", "nx", "nu", "ny"))
 
 
 def _state_space(A: ArrayLike, B: ArrayLike, C: ArrayLike | None) -> tuple[Any, Any, Any]:

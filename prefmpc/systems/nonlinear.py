@@ -42,10 +42,8 @@ class NonlinearSystem(System):
     g : function x (nx,) → y (ny,), optional
         Default: the output is the state.
     nx, nu : int
-    dt : float
-        Sample time in seconds.
-    u_min, u_max : array (nu,) or float, optional
-        Input bounds in the unit of the input; None leaves that side open.
+    dt, u_min, u_max
+        As of `LinearSystem`.
 
     Raises
     ------
@@ -97,10 +95,9 @@ class NonlinearSystem(System):
         u_min: ArrayLike | None = None,
         u_max: ArrayLike | None = None,
     ) -> NonlinearSystem:
-        """Discretise ẋ = f(x, u) by the classical Runge–Kutta method for inputs held over ``dt``.
+        """Discretise ẋ = f(x, u), the input held, by ``substeps`` Runge–Kutta steps a sample.
 
-        ``substeps`` Runge–Kutta steps a sample; the error falls with their fourth power. The rest
-        as in the constructor.
+        The error falls with their fourth power. The rest as in the constructor.
         """
         dt = sample_time(dt)
         got = traced_shape("f(x, u)", f, positive_int("nx", nx), positive_int("nu", nu))
