@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
-import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from decimal import Decimal
 from numbers import Real
 from typing import Any
@@ -17,14 +17,10 @@ from jax.typing import ArrayLike
 LARGEST_INT = 2**31 - 1
 """Of whole numbers: compiled loops count with 32 bits."""
 
-SYMMETRIC = 1e-9
-"""So far a matrix may be from its transpose: rounding, in units in which its diagonal is 1."""
-
-UNDERFLOW = 1e-290
-"""On a diagonal this is 0: products of such weights are no numbers any more."""
-
-INDEFINITE = 1e-10
-"""So far below 0 an eigenvalue of a semidefinite matrix may be: rounding, in the same units."""
+IN_JAX = (
+    ". Write it in jax.numpy: jnp.sin for np.sin or math.sin, jnp.stack for np.array, "
+    "jnp.where for if, x.at[i].set(...) for x[i] = ..."
+)
 
 
 def require_x64() -> None:
@@ -77,7 +73,10 @@ def real_array(name: str, value: Any, *, booleans: bool = False) -> Any:
         good = array.dtype.kind in kinds
         if array.dtype.kind == "O" and array.size:  # whole numbers beyond 64 bits, fractions, …
             entries = [getattr(entry, "item", lambda e=entry: e)() for entry in array.ravel()]
-            good = all(isinstance(e, (Real, Decimal)) and not isinstance(e, bool) for e in entries)
+            good = all(
+                isinstance(e, (Real, Decimal)) and (booleans or not isinstance(e, bool))
+                for e in entries
+            )
         if good:
             return array.astype(np.float64, copy=False)
     except Exception as error:  # whatever the object's own conversion raises
@@ -143,6 +142,21 @@ def function(name: str, value: Any, arguments: int) -> None:
         ) from None
 
 
+@contextlib.contextmanager
+def traced(name: str, kinds: type[Exception] = jax.errors.JAXTypeError) -> Iterator[None]:
+    """Turn what a user's function raises when JAX traces it into a ValueError that names it.
+
+    By default that alone which comes of tracing: NumPy or ``if`` in the place of `jax.numpy`.
+    """
+    try:
+        yield
+    except kinds as error:
+        causes = error, error.__cause__, error.__context__
+        untraceable = any(isinstance(cause, jax.errors.JAXTypeError) for cause in causes)
+        said = str(error).partition("\n")[0].rstrip(".") + (IN_JAX if untraceable else "")
+        raise ValueError(f"{name} must work on JAX arrays, but raised: {said}") from error
+
+
 def choice(name: str, value: Any, options: Sequence[Any]) -> None:
     """Raise a ValueError unless ``value`` is one of the ``options``: texts, or None."""
     if not (value is None or isinstance(value, str)) or value not in options:
@@ -171,8 +185,6 @@ def sequence(name: str, value: Any, wanted: str = "a sequence") -> list[Any]:
 def instances(name: str, value: Any, wanted: type) -> list[Any]:
     """Return a sequence of at least one ``wanted`` as a list, or raise a ValueError."""
     wish = f"a sequence of at least one {wanted.__name__}"
-    if isinstance(value, wanted):
-        raise ValueError(f"{name} must be {wish}, got a single one")
     entries = sequence(name, value, wish)
     if not entries:
         raise ValueError(f"{name} must be {wish}, got none")
@@ -210,15 +222,13 @@ def broadcasts(name: str, batch: tuple[int, ...], models: tuple[int, ...]) -> No
 
 def indices(name: str, value: Any) -> np.ndarray:
     """Return ``value`` as an array of whole numbers or of booleans, or raise a ValueError."""
-    try:
-        lost = isinstance(value, np.ma.MaskedArray) and np.ma.is_masked(value)
-        array = np.asarray(value)
-    except Exception as error:  # whatever the object's own conversion raises
-        raise ValueError(f"{name} must hold whole numbers: {error}") from None
-    if lost or (array.dtype.kind not in "iub" and array.size):
-        got = "masked entries" if lost else f"{array.dtype}"
-        raise ValueError(f"{name} must hold whole numbers, got {got} in shape {array.shape}")
-    return array if array.dtype == bool else array.astype(int)
+    real_array(name, value, booleans=True)
+    index = np.asarray(value)
+    if index.dtype == object:  # of Python's own numbers
+        index = np.array(index.tolist())
+    if index.dtype.kind not in "iub" and index.size:
+        raise ValueError(f"{name} must hold whole numbers, got {index.dtype} {index.shape}")
+    return index if index.dtype == bool else index.astype(int)
 
 
 def is_whole(value: Any) -> bool:
@@ -235,56 +245,55 @@ def positive_int(name: str, value: Any) -> int:
     return int(value)
 
 
-def number(name: str, value: Any, wish: str = "a number") -> float:
-    """Return ``value`` as a float, which may be infinite or NaN, or raise a ValueError."""
-    try:
-        if is_traced(value):
-            raise ValueError
-        return float(real_array(name, value).reshape(()))
-    except ValueError:
-        raise ValueError(f"{name} must be {wish}, got {value!r}") from None
+def number(
+    name: str,
+    value: Any,
+    kind: str = "a number",
+    holds: Callable[[float], bool] = lambda _: True,
+    wish: str | None = None,
+) -> float:
+    """Return ``value`` as a float for which ``holds``, or raise a ValueError.
 
-
-def finite(name: str, value: Any) -> float:
-    """Return ``value`` as a finite float, or raise a ValueError."""
-    out = number(name, value)
-    if not math.isfinite(out):
-        raise ValueError(f"{name} must be finite, got {value!r}")
+    The message names the ``kind`` of a value that is no number, and the ``wish`` (default: to be
+    of that kind) for a number that does not hold.
+    """
+    out = None
+    if not is_traced(value):
+        with contextlib.suppress(ValueError):
+            out = float(real_array(name, value).reshape(()))
+    if out is None or not holds(out):
+        wanted = wish if wish is not None and out is not None else f"be {kind}"
+        raise ValueError(f"{name} must {wanted}, got {value!r}")
     return out
 
 
 def nonnegative(name: str, value: Any, *, allow_inf: bool = False) -> float:
     """Return ``value`` as a float of at least 0, or raise a ValueError."""
-    out = number(name, value, "a number of at least 0")
-    if not (0 <= out < np.inf or (allow_inf and out == np.inf)):
-        wish = "at least 0" if allow_inf else "finite and at least 0"
-        raise ValueError(f"{name} must be {wish}, got {value!r}")
-    return out
+    return number(
+        name,
+        value,
+        "a number of at least 0",
+        lambda v: v >= 0 and (allow_inf or v < np.inf),
+        "be at least 0" if allow_inf else "be finite and at least 0",
+    )
 
 
 def positive(name: str, value: Any, *, allow_inf: bool = False) -> float:
     """Return ``value`` as a float above 0, or raise a ValueError."""
-    out = number(name, value, "a positive number")
-    if not (0 < out < np.inf or (allow_inf and out == np.inf)):
-        wish = "positive" if allow_inf or out <= 0 else "positive and finite"
-        raise ValueError(f"{name} must be {wish}, got {value!r}")
+    out = number(name, value, "a positive number", lambda v: not v <= 0, "be positive")
+    if not (out < np.inf or (allow_inf and out == np.inf)):
+        raise ValueError(f"{name} must be positive and finite, got {value!r}")
     return out
 
 
 def share(name: str, value: Any) -> float:
     """Return ``value`` as a float between 0 and 1, both excluded, or raise a ValueError."""
-    out = number(name, value)
-    if not 0 < out < 1:
-        raise ValueError(f"{name} must lie in (0, 1), got {value!r}")
-    return out
+    return number(name, value, holds=lambda v: 0 < v < 1, wish="lie in (0, 1)")
 
 
 def sample_time(dt: Any) -> float:
     """Return ``dt`` as a float, or raise a ValueError unless it is positive and finite."""
-    out = number("dt", dt, "a positive number of seconds")
-    if not 0 < out < np.inf:
-        raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
-    return out
+    return number("dt", dt, "a positive number of seconds", lambda v: 0 < v < np.inf)
 
 
 def positive_vector(name: str, value: Any) -> np.ndarray:
@@ -295,63 +304,6 @@ def positive_vector(name: str, value: Any) -> np.ndarray:
     return vector
 
 
-def psd_matrix(
-    name: str, value: ArrayLike, *, definite: bool = False, stack: bool = True
-) -> np.ndarray:
-    """Return a (stack of) symmetric positive (semi)definite matrices, or raise a ValueError.
-
-    Each matrix is judged by itself, and in units in which its diagonal is 1: neither a large
-    matrix beside it nor a signal in a small unit hides what is wrong with it.
-
-    Parameters
-    ----------
-    value : array (..., n, n)
-    definite : demand strict positive definiteness.
-    stack : whether there may be more than one.
-    """
-    matrix = np.asarray(finite_array(name, value))
-    if matrix.ndim < 2 or matrix.shape[-1] != matrix.shape[-2] or matrix.shape[-1] == 0:
-        raise ValueError(f"{name} must be a square matrix (..., n, n), got shape {matrix.shape}")
-    if not stack and matrix.ndim != 2:
-        raise ValueError(f"{name} must be one matrix, got shape {matrix.shape}")
-    diagonal = np.diagonal(matrix, axis1=-2, axis2=-1)
-    small = np.abs(diagonal) < UNDERFLOW
-    size = np.sqrt(np.maximum(np.abs(diagonal), UNDERFLOW))
-    lengths = size[..., :, None] * size[..., None, :]
-    transposed = np.swapaxes(matrix, -1, -2)
-    if (np.abs(matrix - transposed) > SYMMETRIC * np.maximum(lengths, np.abs(matrix))).any():
-        raise ValueError(f"{name} must be symmetric, got a matrix that differs from its transpose")
-    kind = "definite" if definite else "semidefinite"
-    if (diagonal[~small] < 0).any() or (definite and small.any()):
-        raise ValueError(
-            f"{name} must be positive {kind}, got {diagonal.min():.3g} on its diagonal"
-        )
-    nothing = small[..., :, None] | small[..., None, :]
-    if (nothing & (np.abs(matrix) > lengths)).any():
-        raise ValueError(
-            f"{name} must be positive {kind}, got a row that is not zero with 0 on its diagonal"
-        )
-    matrix = np.where(nothing, 0.0, matrix / 2 + transposed / 2)
-    smallest = float(np.linalg.eigvalsh(unit_diagonal(matrix)[0]).min(initial=np.inf))
-    least = np.finfo(float).eps * matrix.shape[-1] if definite else -INDEFINITE
-    if not smallest >= least:
-        raise ValueError(
-            f"{name} must be positive {kind}, got a smallest eigenvalue of {smallest:.3g} "
-            "(after scaling its diagonal to 1)"
-        )
-    return matrix
-
-
-def unit_diagonal(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return D⁻¹MD⁻¹ with a diagonal of ones for M (..., n, n) ⪰ 0, and the diagonal of D.
-
-    A diagonal entry 0 stays 0.
-    """
-    size = np.sqrt(np.diagonal(matrix, axis1=-2, axis2=-1))
-    size = np.where(size > 0, size, 1.0)
-    return matrix / size[..., :, None] / size[..., None, :], size
-
-
 def bounds_pair(
     names: tuple[str, str], lower: ArrayLike | None, upper: ArrayLike | None, size: int
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -359,22 +311,21 @@ def bounds_pair(
 
     Equal bounds hold a signal where it is.
     """
-    low = np.full(size, -np.inf) if lower is None else finite_array(names[0], lower, allow_inf=True)
-    high = np.full(size, np.inf) if upper is None else finite_array(names[1], upper, allow_inf=True)
-    out = []
-    for name, bound in zip(names, (np.asarray(low), np.asarray(high)), strict=True):
-        if bound.shape not in ((), (size,)):
-            raise ValueError(f"{name} must be a number or have shape ({size},), got {bound.shape}")
-        out.append(np.broadcast_to(bound, (size,)).copy())
-    low, high = out
+    bounds = []
+    for name, bound, none in zip(names, (lower, upper), (-np.inf, np.inf), strict=True):
+        given = none if bound is None else bound
+        array = np.asarray(finite_array(name, given, allow_inf=True))
+        if array.shape not in ((), (size,)):
+            raise ValueError(f"{name} must be a number or have shape ({size},), got {array.shape}")
+        bounds.append(np.broadcast_to(array, (size,)).copy())
+    low, high = bounds
     if (low == np.inf).any() or (high == -np.inf).any():
         raise ValueError(
             f"{names[0]} must be below infinity and {names[1]} above minus infinity, "
             f"got {low} and {high}"
         )
-    crossed = np.flatnonzero(~(low <= high))
-    if crossed.size:
-        i = int(crossed[0])
+    if (low > high).any():
+        i = int(np.argmax(low > high))
         raise ValueError(
             f"{names[0]} must lie below {names[1]} or at it, "
             f"got {low[i]:g} and {high[i]:g} at index {i}"

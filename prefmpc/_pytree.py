@@ -20,24 +20,29 @@ T = TypeVar("T")
 def bypass_init(cls: type[T], **fields: Any) -> T:
     """Build an instance of the frozen dataclass ``cls`` without validation."""
     instance = object.__new__(cls)
+    set_fields(instance, **fields)
+    return instance
+
+
+def set_fields(instance: Any, **fields: Any) -> None:
+    """Set the fields of a frozen dataclass, in its own constructor."""
     for name, value in fields.items():
         object.__setattr__(instance, name, value)
-    return instance
 
 
 def register_pytree(cls: type[T], static: tuple[str, ...] = ()) -> type[T]:
     """Register the dataclass ``cls`` as a pytree; the fields in ``static`` are not leaves."""
     names = [field.name for field in dataclasses.fields(cls)]  # type: ignore[arg-type]
-    leaves = tuple(name for name in names if name not in static)
-
-    def flatten_with_keys(instance: T) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
-        children = [(jax.tree_util.GetAttrKey(name), getattr(instance, name)) for name in leaves]
-        return children, tuple(getattr(instance, name) for name in static)
+    leaves = [name for name in names if name not in static]
+    keys = [jax.tree_util.GetAttrKey(name) for name in leaves]
 
     def flatten(instance: T) -> tuple[list[Any], tuple[Any, ...]]:
-        return [getattr(instance, name) for name in leaves], tuple(
-            getattr(instance, name) for name in static
-        )
+        metadata = tuple([getattr(instance, name) for name in static])
+        return [getattr(instance, name) for name in leaves], metadata
+
+    def flatten_with_keys(instance: T) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
+        children, metadata = flatten(instance)
+        return list(zip(keys, children, strict=True)), metadata
 
     def unflatten(metadata: tuple[Any, ...], children: Any) -> T:
         fields = dict(zip(leaves, children, strict=True))

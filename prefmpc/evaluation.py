@@ -13,9 +13,11 @@ from jax.typing import ArrayLike
 from prefmpc._checks import function, instance, positive_int, real_array, share, single
 from prefmpc.mpc.solution import Controller, check_state
 from prefmpc.preferences.comparisons import Comparisons
-from prefmpc.preferences.people import Preference, asked, failed_loses
-from prefmpc.preferences.trajectories import Trajectory, failed, from_flat
+from prefmpc.preferences.people import Preference, asked, evaluated, failed_loses
+from prefmpc.preferences.trajectories import Trajectory, check_finite, from_flat
 from prefmpc.systems.linear import System
+
+__all__ = ["WinRate", "accuracy", "regret", "simulate", "win_rate"]
 
 SAME_START = 1e-9
 """So far apart two states may be to count as the same, relative to the largest on the way."""
@@ -32,12 +34,7 @@ def accuracy(model: Callable[[Trajectory], Any], comparisons: Comparisons) -> fl
     """
     function("model", model, 1)
     instance("comparisons", comparisons, Comparisons)
-    costs = np.asarray(real_array("what model returns", model(comparisons.trajectories)))
-    count = len(comparisons.trajectories)
-    if costs.shape != (count,):
-        raise ValueError(f"model must return one cost a trajectory ({count},), got {costs.shape}")
-    if not np.isfinite(costs).all():
-        raise ValueError("model must return finite costs, got NaN or infinite ones")
+    costs = _finite("model", model, comparisons.trajectories)
     first_wins = costs[comparisons.first] <= costs[comparisons.second]
     return float(np.where(first_wins, comparisons.labels, 1 - comparisons.labels).mean())
 
@@ -149,17 +146,14 @@ def win_rate(
 
 
 def _costs(cost: Callable[[Trajectory], Any], name: str, trajectories: Trajectory) -> np.ndarray:
-    if (bad := failed(trajectories)).any():
-        raise ValueError(
-            f"{name} must be finite, got {int(bad.sum())} of {bad.size} with NaN or infinite "
-            "values: closed loops that failed have no cost"
-        )
-    values = np.asarray(real_array("what cost returns", cost(trajectories)))
-    if values.shape != trajectories.batch_shape or not np.isfinite(values).all():
-        raise ValueError(
-            f"cost must return one finite number a trajectory {trajectories.batch_shape}, "
-            f"got shape {values.shape}"
-        )
+    check_finite(name, trajectories, "closed loops that failed have no cost")
+    return _finite("cost", cost, trajectories)
+
+
+def _finite(name: str, cost: Callable[[Trajectory], Any], trajectories: Trajectory) -> np.ndarray:
+    values = evaluated(name, cost, trajectories, "cost")
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} must return finite costs, got NaN or infinite ones")
     return values
 
 

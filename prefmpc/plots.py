@@ -65,12 +65,10 @@ def responses(
     step : bool
         Hold each value until the next sample, as inputs do.
     """
-    signals = _named("responses", responses)
+    signals = _named("responses", responses, "steps")
     dt = sample_time(dt)
     ax = ax if ax is not None else plt.subplots(figsize=(6.4, 3.0))[1]
     for label, values in signals.items():
-        if values.ndim != 1:
-            raise ValueError(f"responses[{label!r}] must have shape (steps,), got {values.shape}")
         time = dt * np.arange(values.size)
         if step:
             ax.step(time, values, where="post", label=label)
@@ -104,10 +102,7 @@ def boxes(
     reference : float, optional
         A horizontal line to compare with.
     """
-    samples = _named("values", values)
-    for label, sample in samples.items():
-        if sample.ndim != 1:
-            raise ValueError(f"values[{label!r}] must have shape (n,), got {sample.shape}")
+    samples = _named("values", values, "n")
     ax = ax if ax is not None else plt.subplots(figsize=(6.4, 3.2))[1]
     drawn = ax.boxplot(
         list(samples.values()),
@@ -153,14 +148,17 @@ def heatmaps(matrices: Mapping[str, ArrayLike], names: Sequence[str] = ()) -> Fi
     return figure
 
 
-def _named(name: str, values: Any) -> dict[str, np.ndarray]:
+def _named(name: str, values: Any, size: str | None = None) -> dict[str, np.ndarray]:
+    """Return a mapping of labels to arrays; with ``size``, the name of it, to vectors."""
     instance(name, values, Mapping)
     if not values:
         raise ValueError(f"{name} must hold at least one entry, got none")
-    return {
-        label: np.asarray(real_array(f"{name}[{label!r}]", value))
-        for label, value in values.items()
-    }
+    arrays = {}
+    for label, value in values.items():
+        arrays[label] = array = np.asarray(real_array(f"{name}[{label!r}]", value))
+        if size is not None and array.ndim != 1:
+            raise ValueError(f"{name}[{label!r}] must have shape ({size},), got {array.shape}")
+    return arrays
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]], caption: str) -> Any:

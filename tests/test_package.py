@@ -5,16 +5,25 @@ from __future__ import annotations
 import ast
 import importlib
 import inspect
+import io
 import os
 import pkgutil
+import re
 import subprocess
 import sys
+import tokenize
 from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 import prefmpc
+
+LINES, CODE = 12_500, 8_250
+"""The library has at most so many lines, and so many without docstrings, comments and blanks."""
+
+FILE, FUNCTION, HOUR = 350, 60, 3_500
+"""Lines at most of a file, of a function without its docstring, and of the one-hour read."""
 
 ROOT = Path(prefmpc.__file__).resolve().parent
 TESTS = Path(__file__).resolve().parent
@@ -81,12 +90,10 @@ def test_without_float64_every_door_says_what_to_call():
 
 def test_exported_names_are_sorted_and_complete():
     assert prefmpc.__all__ == sorted(prefmpc.__all__)
-    found = {
-        name
-        for name, value in vars(prefmpc).items()
-        if not name.startswith("_") and not inspect.ismodule(value)
-    }
-    assert found - {"annotations"} == set(prefmpc.__all__)
+    rooms = [importlib.import_module(f"prefmpc.{room}") for room in ROOMS if room != "plots"]
+    listed = [name for room in rooms for name in room.__all__]
+    assert sorted(listed) == prefmpc.__all__
+    assert all(room.__all__ == sorted(room.__all__) for room in rooms)
 
 
 @pytest.mark.parametrize("name", ["prefmpc", *MODULES])
@@ -136,13 +143,116 @@ def imported(path):
     return used
 
 
-@pytest.mark.parametrize("path", sorted(ROOT.rglob("*.py")), ids=lambda path: path.name)
+EACH_FILE = pytest.mark.parametrize(
+    "path", sorted(ROOT.rglob("*.py")), ids=lambda path: str(path.relative_to(ROOT))
+)
+
+
+@EACH_FILE
 def test_imports_follow_the_rooms(path):
     room = path.relative_to(ROOT).parts[0].removesuffix(".py")
     if room == "__init__":
         return
     used = {names[0] for names in imported(path)} - HELPERS
     assert used <= (set() if room in HELPERS else ROOMS[room] | {room})
+
+
+def test_between_plants_and_the_package_are_four_rooms_at_most():
+    graph = {}
+    for path in ROOT.rglob("*.py"):
+        room = path.relative_to(ROOT).parts[0].removesuffix(".py")
+        graph.setdefault(room, set()).update(names[0] for names in imported(path))
+    depth = {}
+    for room in TopologicalSorter({a: b - {a} for a, b in graph.items()}).static_order():
+        if room not in HELPERS:
+            depth[room] = 1 + max((depth[used] for used in graph[room] & depth.keys()), default=-1)
+    assert depth["systems"] == 0
+    assert depth["__init__"] - 1 <= 4, depth
+
+
+SOLVERS = {
+    *("cvxpy", "osqp", "clarabel", "scipy.optimize", "jaxopt", "optax", "control"),
+    *("ipyopt", "daqp", "piqp", "qpax", "casadi"),
+}
+
+
+@EACH_FILE
+def test_a_module_knows_one_solver_at_most(path):
+    names = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            names |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    used = {one for one in SOLVERS for name in names if f"{name}.".startswith(f"{one}.")}
+    assert len(used) <= 1, used
+
+
+def documented(tree):
+    """Return the functions, classes and the module that have a docstring, each with that."""
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    nodes = [node for node in ast.walk(tree) if isinstance(node, kinds)]
+    return {node: node.body[0] for node in nodes if ast.get_docstring(node, clean=False)}
+
+
+def height(node):
+    return node.end_lineno - node.lineno + 1
+
+
+@EACH_FILE
+def test_files_and_functions_are_short(path):
+    text = path.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= FILE
+    tree = ast.parse(text)
+    docs = documented(tree)
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            lines = height(node) - (height(docs[node]) if node in docs else 0)
+            assert lines <= FUNCTION, f"{node.name} has {lines} lines"
+
+
+def code_lines(text):
+    """Count the lines that hold code: no docstring, comment or blank."""
+    lines = set()
+    nothing = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT}
+    for token in tokenize.generate_tokens(io.StringIO(text).readline):
+        if token.type not in nothing | {tokenize.ENDMARKER}:
+            lines |= set(range(token.start[0], token.end[0] + 1))
+    for doc in documented(ast.parse(text)).values():
+        lines -= set(range(doc.lineno, doc.end_lineno + 1))
+    return len(lines)
+
+
+def test_the_library_stays_small():
+    texts = [path.read_text(encoding="utf-8") for path in ROOT.rglob("*.py")]
+    assert sum(len(text.splitlines()) for text in texts) <= LINES
+    assert sum(map(code_lines, texts)) <= CODE
+
+
+def test_the_paper_alone_is_read_in_an_hour():
+    """CONTRIBUTING lists the files of that read, and how many lines they have in all."""
+    guide = (ROOT.parent / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    section = guide.split("## The one-hour read")[1].split("\n## ")[0]
+    files = [ROOT / name for name in re.findall(r"`(\w+/?\w+\.py)`", section)]
+    lines = sum(len(path.read_text(encoding="utf-8").splitlines()) for path in files)
+    (said,) = re.findall(r"about ([\d,]+) lines", section)
+    assert len(files) == len(set(files)) > 10
+    assert abs(lines - int(said.replace(",", ""))) <= 100, lines
+    assert lines <= HOUR
+
+
+def test_the_wheel_holds_the_library_and_no_studies():
+    listed = run(
+        "from setuptools import Distribution\n"
+        "plan = Distribution({'script_name': 'setup.py'})\n"
+        "plan.parse_config_files()\n"
+        "command = plan.get_command_obj('build_py')\n"
+        "command.ensure_finalized()\n"
+        "print(*command.get_outputs(include_bytecode=False), sep='\\n')"
+    )
+    built = {str(Path(line).relative_to("build/lib")) for line in listed.split()}
+    there = {str(path.relative_to(ROOT.parent)) for path in ROOT.rglob("*.py")}
+    assert built == there | {"prefmpc/py.typed"}
 
 
 def test_no_module_depends_on_itself():

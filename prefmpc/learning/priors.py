@@ -9,7 +9,8 @@ from typing import Any, Literal
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import is_whole, positive, positive_vector, psd_matrix, sequence
+from prefmpc._checks import is_whole, positive, positive_vector, sequence
+from prefmpc._matrices import psd_matrix
 
 Structure = Literal["full", "diagonal"] | tuple[np.ndarray, np.ndarray]
 """Which entries of Q and R may differ from zero: by name, or as two masks (see `blocks`)."""

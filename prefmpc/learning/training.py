@@ -21,6 +21,7 @@ from prefmpc._checks import (
     require_x64,
     share,
     to_numpy,
+    traced,
 )
 from prefmpc._random import generator
 from prefmpc.learning._lbfgsb import minimise
@@ -170,7 +171,8 @@ def fit(
 
     settings = (l2, l1, learning_rate, positive_int("max_iterations", max_iterations), tol)
     split_signs = l1 > 0  # |θ| is smooth only where θ is split into its two signs
-    out = _train(starts, data, settings, positive_int("adam_steps", adam_steps), split_signs)
+    with traced("initial"):
+        out = _train(starts, data, settings, positive_int("adam_steps", adam_steps), split_signs)
     models, loss, accuracy, iterations, error, violation = to_numpy(out)
 
     finite = np.isfinite(loss)

@@ -15,12 +15,11 @@ from prefmpc._checks import (
     broadcasts,
     instance,
     nonnegative,
-    psd_matrix,
     require_x64,
     sequence,
     shaped,
-    unit_diagonal,
 )
+from prefmpc._matrices import psd_matrix, unit_diagonal
 from prefmpc._pytree import Stack, bypass_init, constant_like, register_pytree
 from prefmpc.preferences.pools import random_weights
 from prefmpc.preferences.trajectories import Trajectory, second_moments

@@ -15,12 +15,12 @@ from jax.typing import ArrayLike
 from prefmpc._checks import (
     choice,
     finite_array,
-    function,
     instance,
     nonnegative,
     positive_int,
     shaped,
     single,
+    traced,
 )
 from prefmpc._pytree import bypass_init
 from prefmpc.models.quadratic import CostModel, check_model
@@ -39,6 +39,7 @@ from prefmpc.mpc.steady import SteadyState, check_reference, with_reference
 from prefmpc.mpc.terminal import TerminalIngredients, check_polyhedron, terminal_set
 from prefmpc.preferences.trajectories import Trajectory
 from prefmpc.systems.linear import System
+from prefmpc.systems.nonlinear import traced_shape
 from prefmpc.systems.sets import Ellipsoid, Polyhedron
 
 Solver = Literal["slsqp", "ipopt"]
@@ -108,7 +109,6 @@ class NonlinearMPC(Controller):
         self.max_iterations = positive_int("max_iterations", max_iterations)
         self._path = path
         if path is not None:
-            function("path", path, 2)
             _check_path(path, system)
         self._problem = self._sets(constraints, terminal)
         self._rows = shooting.rows(self._problem, path, self.horizon)
@@ -143,10 +143,12 @@ class NonlinearMPC(Controller):
         x, u = np.zeros((N + 1, system.nx)), np.zeros((N, system.nu))
         y = np.zeros((N, system.ny))
         r = {"x_r": x[0], "u_r": u[0], "y_r": y[0]}
-        try:
-            jax.eval_shape(self.cost, bypass_init(Trajectory, x=x, u=u, y=y, u_before=u[0], **r))
-        except ValueError as error:
-            raise ValueError(f"cost must fit the system and the horizon: {error}") from None
+        trajectory = bypass_init(Trajectory, x=x, u=u, y=y, u_before=u[0], **r)
+        with traced("cost"):
+            try:
+                jax.eval_shape(self.cost, trajectory)
+            except ValueError as error:
+                raise ValueError(f"cost must fit the system and the horizon: {error}") from None
 
     def reset(self) -> None:
         """Forget the last plan and the last input."""
@@ -355,10 +357,6 @@ class NonlinearMPC(Controller):
 
 
 def _check_path(path: Callable[[Any, Any], Any], system: System) -> None:
-    x, u = (jax.ShapeDtypeStruct((size,), np.float64) for size in (system.nx, system.nu))
-    try:
-        shape = jax.eval_shape(path, x, u).shape
-    except Exception as error:
-        raise ValueError(f"path(x, u) must work on JAX arrays, but raised: {error}") from error
+    shape = traced_shape("path(x, u)", path, system.nx, system.nu)
     if len(shape) != 1:
         raise ValueError(f"path must return an array of shape (m,), got shape {shape}")

@@ -13,9 +13,10 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import finite_array, flag, function, indices, positive_int
 from prefmpc._files import atomic_write
+from prefmpc._pytree import set_fields
 from prefmpc._random import generator
 from prefmpc.preferences.people import Preference, asked
-from prefmpc.preferences.trajectories import Trajectory, failed
+from prefmpc.preferences.trajectories import Trajectory, check_finite
 
 _FORMAT_VERSIONS = (1, 2)  # (x, u, y) alone, and with what is optional
 _OPTIONAL = ("x_r", "u_r", "y_r", "u_before")
@@ -58,14 +59,9 @@ class Comparisons:
             raise ValueError(
                 f"labels must lie in [0, 1] (P(first is preferred)), got {labels[i]:g} at index {i}"
             )
-        values: dict[str, Any] = {
-            "trajectories": trajectories,
-            "first": _pair_indices("first", first, labels.size, len(trajectories)),
-            "second": _pair_indices("second", second, labels.size, len(trajectories)),
-            "labels": labels,
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        first = _pair_indices("first", first, labels.size, len(trajectories))
+        second = _pair_indices("second", second, labels.size, len(trajectories))
+        set_fields(self, trajectories=trajectories, first=first, second=second, labels=labels)
 
     def __len__(self) -> int:
         """Number of comparisons n_p."""
@@ -145,14 +141,13 @@ class Comparisons:
         """
         first = _recorded("first", x_first, u_first, y_first)
         second = _recorded("second", x_second, u_second, y_second)
-        shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(side)] for side in (first, second)]
-        if len(first.batch_shape) != 1 or shapes[0] != shapes[1]:
-            raise ValueError(
-                "first and second must have equal shapes with one leading dimension, got x_first "
-                f"{np.shape(first.x)}, x_second {np.shape(second.x)}, u_first {np.shape(first.u)}, "
-                f"u_second {np.shape(second.u)}, y_first {np.shape(first.y)} and y_second "
-                f"{np.shape(second.y)}"
-            )
+        for name in ("x", "u", "y"):
+            a, b = (getattr(side, name).shape for side in (first, second))
+            if len(a) != 3 or a != b:
+                raise ValueError(
+                    f"{name}_first and {name}_second must have equal shapes with one leading "
+                    f"dimension, got {a} and {b}"
+                )
         n = len(first)
         answers = finite_array("labels", labels, booleans=True)
         if answers.size and answers.shape != (n,):
@@ -250,11 +245,7 @@ def _check_pool(trajectories: Any) -> None:
             "trajectories must have one leading dimension (n_t trajectories), "
             f"got batch shape {trajectories.batch_shape}"
         )
-    if (bad := failed(trajectories)).any():
-        raise ValueError(
-            f"trajectories must be finite, got {int(bad.sum())} of {bad.size} with NaN or infinite "
-            f"values (closed loops that failed?), the first at index {int(np.argmax(bad))}"
-        )
+    check_finite("trajectories", trajectories, "closed loops that failed?")
 
 
 def _pairs_from_one_start(
@@ -264,9 +255,7 @@ def _pairs_from_one_start(
     order = np.argsort(group, kind="stable")
     count = np.bincount(group)
     begin = np.cumsum(count) - count
-    place = np.empty_like(order)
-    place[order] = np.arange(order.size)
-    place -= begin[group]  # of each trajectory among those with its start
+    place = np.argsort(order) - begin[group]  # of each trajectory among those with its start
     candidates = np.flatnonzero(count[group] > 1)
     if not candidates.size:
         raise ValueError(

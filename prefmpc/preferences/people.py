@@ -17,15 +17,8 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import (
-    choice,
-    function,
-    instance,
-    nonnegative,
-    positive,
-    psd_matrix,
-    real_array,
-)
+from prefmpc._checks import choice, function, instance, nonnegative, positive, real_array
+from prefmpc._matrices import psd_matrix
 from prefmpc.preferences.trajectories import Trajectory, failed, max_input, phi, settling_time
 
 Preference = Callable[[Trajectory, Trajectory], Any]
@@ -255,14 +248,24 @@ def _smaller(a: Any, b: Any, tolerance: float) -> np.ndarray:
     return np.where(a < b - tolerance, 1.0, np.where(a > b + tolerance, 0.0, 0.5))
 
 
-def _judge(criterion: Criterion, trajectory: Trajectory) -> np.ndarray:
-    given = real_array("what criterion returns", criterion(trajectory))
-    values = np.array(given)
-    if values.shape == trajectory.batch_shape:
-        values = np.where(failed(trajectory), np.inf, values)
-    if values.shape != trajectory.batch_shape or np.isnan(values).any():
+def _judge(criterion: Criterion, trajectories: Trajectory) -> np.ndarray:
+    values = evaluated("criterion", criterion, trajectories)
+    values = np.where(failed(trajectories), np.inf, values)
+    if np.isnan(values).any():
         raise ValueError(
-            f"criterion must return one number a trajectory {trajectory.batch_shape}, "
-            f"got shape {values.shape}" + (" with NaN" if np.isnan(values).any() else "")
+            f"criterion must return one number a trajectory, got shape {values.shape} with NaN"
+        )
+    return values
+
+
+def evaluated(
+    name: str, function: Criterion, trajectories: Trajectory, kind: str = "number"
+) -> np.ndarray:
+    """Return what a user's function says of each trajectory of a batch (...)."""
+    values = np.asarray(real_array(f"what {name} returns", function(trajectories)))
+    if values.shape != trajectories.batch_shape:
+        raise ValueError(
+            f"{name} must return one {kind} a trajectory {trajectories.batch_shape}, "
+            f"got shape {values.shape}"
         )
     return values

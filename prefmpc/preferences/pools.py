@@ -13,11 +13,11 @@ from prefmpc._checks import (
     leading_shape,
     nonnegative,
     positive_int,
-    psd_matrix,
     require_x64,
     sequence,
     single,
 )
+from prefmpc._matrices import psd_matrix
 from prefmpc._random import generator
 from prefmpc.preferences.trajectories import Trajectory, rollout
 from prefmpc.systems.linear import LinearSystem

@@ -20,13 +20,14 @@ from prefmpc._checks import (
     is_traced,
     nonnegative,
     positive_int,
-    psd_matrix,
     real_array,
     shaped,
     single,
     to_numpy,
+    traced,
 )
-from prefmpc._pytree import Stack, bypass_init, register_pytree
+from prefmpc._matrices import psd_matrix
+from prefmpc._pytree import Stack, bypass_init, register_pytree, set_fields
 from prefmpc.systems.linear import LinearSystem, System
 
 
@@ -106,8 +107,7 @@ class Trajectory(Stack):
         for name, value in {"x_r": x_r, "u_r": u_r, "y_r": y_r, "u_before": u_before}.items():
             if value is not None:
                 values[name] = _reference(name, value, values[name[0]])
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        set_fields(self, **values)
 
     def deviation(self) -> Trajectory:
         """Return the same trajectory as deviations from its set point, which is then zero.
@@ -146,6 +146,15 @@ def failed(trajectory: Trajectory) -> np.ndarray:
     """Say which trajectories (...) hold NaN or infinite values: closed loops that failed."""
     parts = (trajectory.x, trajectory.u, trajectory.y)
     return ~np.all([np.isfinite(np.asarray(part)).all((-2, -1)) for part in parts], axis=0)
+
+
+def check_finite(name: str, trajectories: Trajectory, note: str) -> None:
+    """Raise a ValueError if a trajectory holds NaN or infinite values."""
+    if (bad := failed(trajectories)).any():
+        raise ValueError(
+            f"{name} must be finite, got {int(bad.sum())} of {bad.size} with NaN or infinite "
+            f"values ({note}), the first at index {int(np.argmax(bad))}"
+        )
 
 
 def _reference(name: str, value: ArrayLike, signal: Any) -> Any:
@@ -272,17 +281,18 @@ def rollout(
     steps = positive_int("steps", steps)
     batch = starts.shape[:-1]
     flat = starts.reshape(-1, system.nx)
+    gains = None
     if callable(law):
         function("law", law, 1)
-        x, u = _rollout_law(system, flat, steps, law, flag("saturate", saturate))
+        feedback: Callable[..., Any] = law
     else:
         K = shaped("law", finite_array("law", law), (system.nu, system.nx), "a gain K")
         if K.shape[:-2] not in ((), batch):
             raise ValueError(f"law must hold one gain or one for each x0 {batch}, got {K.shape}")
         gains = array_module(K).broadcast_to(K, (*batch, system.nu, system.nx))
-        gains = gains.reshape(-1, system.nu, system.nx)
-        x, u = _rollout_gain(system, flat, steps, gains, flag("saturate", saturate))
-    x, u = to_numpy((x, u))
+        gains, feedback = gains.reshape(-1, system.nu, system.nx), _feedback
+    with traced("law(x)"):
+        x, u = to_numpy(_rollout(system, flat, steps, feedback, gains, flag("saturate", saturate)))
     if not isinstance(system, LinearSystem) and not is_traced(x):
         check_finite_states(x)
     return from_flat(system, x, u, batch)
@@ -308,31 +318,27 @@ def from_flat(system: System, x: Any, u: Any, batch: tuple[int, ...]) -> Traject
     return bypass_init(Trajectory, x=x, u=u, y=system.output(x[..., :-1, :]))
 
 
-def _scan(
-    system: System, x0: Any, steps: int, law: Callable[[Any], Any], saturate: bool
-) -> tuple[Any, Any]:
-    def step(x: Any, _: None) -> tuple[Any, tuple[Any, Any]]:
-        u = real_array("what law returns", law(x))
-        if u.shape != (system.nu,):
-            raise ValueError(f"law must return shape ({system.nu},), got {u.shape}")
-        if saturate:
-            u = jnp.clip(u, system.u_min, system.u_max)
-        x_next = system.step(x, u)
-        return x_next, (x_next, u)
-
-    _, (x, u) = jax.lax.scan(step, x0, None, length=steps)
-    return jnp.concatenate([x0[None], x]), u
+def _feedback(x: Any, K: Any) -> Any:
+    return -K @ x
 
 
-@jax.jit(static_argnums=(2, 3, 4))
-def _rollout_law(
-    system: System, x0: Any, steps: int, law: Callable[[Any], Any], saturate: bool
+@jax.jit(static_argnums=(2, 3, 5))
+def _rollout(
+    system: System, x0: Any, steps: int, law: Callable[..., Any], gains: Any, saturate: bool
 ) -> Any:
-    return jax.vmap(lambda start: _scan(system, start, steps, law, saturate))(x0)
+    """Return x (m, steps + 1, nx) and u (m, steps, nu) under law(x), or law(x, K) with gains."""
 
+    def run(start: Any, gain: Any) -> tuple[Any, Any]:
+        def step(x: Any, _: None) -> tuple[Any, tuple[Any, Any]]:
+            u = real_array("what law returns", law(x) if gain is None else law(x, gain))
+            if u.shape != (system.nu,):
+                raise ValueError(f"law must return shape ({system.nu},), got {u.shape}")
+            if saturate:
+                u = jnp.clip(u, system.u_min, system.u_max)
+            x_next = system.step(x, u)
+            return x_next, (x_next, u)
 
-@jax.jit(static_argnums=(2, 4))
-def _rollout_gain(system: System, x0: Any, steps: int, K: Any, saturate: bool) -> Any:
-    return jax.vmap(lambda start, gain: _scan(system, start, steps, lambda x: -gain @ x, saturate))(
-        x0, K
-    )
+        _, (x, u) = jax.lax.scan(step, start, None, length=steps)
+        return jnp.concatenate([start[None], x]), u
+
+    return jax.vmap(run)(x0, gains)

@@ -1,6 +1,6 @@
 """Plants: linear and nonlinear ones, the book's own, and sets that states and inputs keep to."""
 
-from prefmpc.systems.linear import LinearSystem, System, oscillating_masses
+from prefmpc.systems.linear import LinearSystem, oscillating_masses
 from prefmpc.systems.nonlinear import NonlinearSystem
 from prefmpc.systems.plants import cart_pendulum, kinematic_bicycle
 from prefmpc.systems.sets import Ellipsoid, Polyhedron, SecondOrderCone
@@ -11,7 +11,6 @@ __all__ = [
     "NonlinearSystem",
     "Polyhedron",
     "SecondOrderCone",
-    "System",
     "cart_pendulum",
     "kinematic_bicycle",
     "oscillating_masses",

@@ -16,11 +16,12 @@ from prefmpc._checks import (
     finite_array,
     instances,
     nonnegative,
-    psd_matrix,
+    real_array,
     sample_time,
     single,
 )
-from prefmpc._pytree import Stack, register_pytree
+from prefmpc._matrices import psd_matrix
+from prefmpc._pytree import Stack, register_pytree, set_fields
 from prefmpc._units import cost_units
 
 if TYPE_CHECKING:
@@ -31,7 +32,11 @@ RICCATI = 1e-8
 
 
 class System:
-    """A discrete-time plant x⁺ = f(x, u), y = g(x) with input bounds; see its two kinds."""
+    """A discrete-time plant x⁺ = f(x, u), y = g(x) with input bounds; see its two kinds.
+
+    It has nx states, nu inputs and ny outputs, a sample time ``dt`` in seconds, and limits
+    u_min, u_max (nu,) in the unit of the input, ±inf where there are none.
+    """
 
     nx: int
     nu: int
@@ -79,6 +84,9 @@ class LinearSystem(System, Stack):
     u_min: np.ndarray
     u_max: np.ndarray
     dt: float
+    nx: int
+    nu: int
+    ny: int
 
     def __init__(
         self,
@@ -91,19 +99,18 @@ class LinearSystem(System, Stack):
         u_max: ArrayLike | None = None,
     ) -> None:
         a, b, c = _state_space(A, B, C)
-        dt = sample_time(dt)
         low, high = bounds_pair(("u_min", "u_max"), u_min, u_max, b.shape[1])
-        values = {"A": a, "B": b, "C": c, "u_min": low, "u_max": high, "dt": dt}
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        sizes = {"nx": len(a), "nu": b.shape[1], "ny": len(c)}
+        set_fields(self, A=a, B=b, C=c, u_min=low, u_max=high, dt=sample_time(dt), **sizes)
 
     def step(self, x: Any, u: Any) -> Any:
         """Return x⁺ = A x + B u, shape (..., nx)."""
+        x, u = real_array("x", x), real_array("u", u)
         return x @ self.A.swapaxes(-1, -2) + u @ self.B.swapaxes(-1, -2)
 
     def output(self, x: Any) -> Any:
         """Return y = C x, shape (..., ny)."""
-        return x @ self.C.swapaxes(-1, -2)
+        return real_array("x", x) @ self.C.swapaxes(-1, -2)
 
     @classmethod
     def stack(cls, systems: Sequence[LinearSystem]) -> LinearSystem:
@@ -130,21 +137,6 @@ class LinearSystem(System, Stack):
         if not self.batch_shape:
             raise TypeError("a single plant has no length")
         return self.batch_shape[0]
-
-    @property
-    def nx(self) -> int:  # type: ignore[override]
-        """Number of states."""
-        return int(self.A.shape[-1])
-
-    @property
-    def nu(self) -> int:  # type: ignore[override]
-        """Number of inputs."""
-        return int(self.B.shape[-1])
-
-    @property
-    def ny(self) -> int:  # type: ignore[override]
-        """Number of outputs."""
-        return int(self.C.shape[-2])
 
     @classmethod
     def from_continuous(
@@ -193,21 +185,17 @@ class LinearSystem(System, Stack):
             )
         if np.any(np.asarray(system.D)):
             raise ValueError(f"system must have D = 0 (the output is y = C x), got D = {system.D}")
-        if system.isctime(strict=True) or system.dt == 0:
-            if dt is None:
-                raise ValueError("dt must be given for a continuous-time system, got None")
-            return cls.from_continuous(
-                system.A, system.B, system.C, dt=dt, u_min=u_min, u_max=u_max
-            )
-        unknown = system.dt is None or system.dt is True
-        own = None if unknown else float(system.dt)
-        if own is None and dt is None:
-            raise ValueError(f"dt must be given: the system's own sample time is {system.dt!r}")
-        if own is not None and dt is not None and not np.isclose(own, sample_time(dt), atol=0):
-            raise ValueError(f"dt must equal the system's own sample time {own}, got {dt}")
-        chosen = own if own is not None else dt
-        assert chosen is not None
-        return cls(system.A, system.B, system.C, dt=chosen, u_min=u_min, u_max=u_max)
+        continuous = system.isctime(strict=True) or system.dt == 0
+        if not (continuous or system.dt is None or system.dt is True):
+            own = float(system.dt)
+            if dt is not None and not np.isclose(own, sample_time(dt), atol=0):
+                raise ValueError(f"dt must equal the system's own sample time {own}, got {dt}")
+            dt = own
+        if dt is None:
+            kind = "continuous-time" if continuous else "discrete-time"
+            raise ValueError(f"dt must be given for a {kind} system without its own, got None")
+        make = cls.from_continuous if continuous else cls
+        return make(system.A, system.B, system.C, dt=dt, u_min=u_min, u_max=u_max)
 
     def to_control(self) -> control.StateSpace:
         """Return the same plant as a python-control ``StateSpace`` (without the input bounds)."""
@@ -254,7 +242,7 @@ class LinearSystem(System, Stack):
         return K * du[:, None] / dx, P / dx / dx[:, None]
 
 
-register_pytree(LinearSystem, static=("dt",))
+register_pytree(LinearSystem, static=("dt", "nx", "nu", "ny"))
 
 
 def _state_space(A: ArrayLike, B: ArrayLike, C: ArrayLike | None) -> tuple[Any, Any, Any]:

@@ -15,12 +15,14 @@ from prefmpc._checks import (
     bounds_pair,
     finite_array,
     function,
-    is_traced,
     positive_int,
+    real_array,
     sample_time,
     shaped,
+    to_numpy,
+    traced,
 )
-from prefmpc._pytree import register_pytree
+from prefmpc._pytree import register_pytree, set_fields
 from prefmpc.systems.linear import LinearSystem, System
 
 Dynamics = Callable[[Any, Any], Any]
@@ -40,10 +42,8 @@ class NonlinearSystem(System):
     g : function x (nx,) → y (ny,), optional
         Default: the output is the state.
     nx, nu : int
-    dt : float
-        Sample time in seconds.
-    u_min, u_max : array (nu,) or float, optional
-        Input bounds in the unit of the input; None leaves that side open.
+    dt, u_min, u_max
+        As of `LinearSystem`.
 
     Raises
     ------
@@ -72,21 +72,15 @@ class NonlinearSystem(System):
         u_max: ArrayLike | None = None,
     ) -> None:
         nx, nu = positive_int("nx", nx), positive_int("nu", nu)
-        dt = sample_time(dt)
-        function("f", f, 2)
         output = _state_itself if g is None else g
-        function("g", output, 1)
         low, high = bounds_pair(("u_min", "u_max"), u_min, u_max, nu)
-        x, u = (jax.ShapeDtypeStruct((size,), np.float64) for size in (nx, nu))
-        got = _shape_of("f(x, u)", f, x, u)
-        if got != (nx,):
+        if (got := traced_shape("f(x, u)", f, nx, nu)) != (nx,):
             raise ValueError(f"f must return the next state, shape ({nx},), got shape {got}")
-        ny = _shape_of("g(x)", output, x)
+        ny = traced_shape("g(x)", output, nx)
         if len(ny) != 1 or not ny[0]:
             raise ValueError(f"g must return an output of shape (ny,), got shape {ny}")
-        values = {"f": f, "g": output, "u_min": low, "u_max": high, "dt": dt}
-        for name, value in {**values, "nx": nx, "nu": nu, "ny": int(ny[0])}.items():
-            object.__setattr__(self, name, value)
+        sizes = {"nx": nx, "nu": nu, "ny": int(ny[0])}
+        set_fields(self, f=f, g=output, u_min=low, u_max=high, dt=sample_time(dt), **sizes)
 
     @classmethod
     def from_continuous(
@@ -101,21 +95,12 @@ class NonlinearSystem(System):
         u_min: ArrayLike | None = None,
         u_max: ArrayLike | None = None,
     ) -> NonlinearSystem:
-        """Discretise ẋ = f(x, u) by the classical Runge–Kutta method for inputs held over ``dt``.
+        """Discretise ẋ = f(x, u), the input held, by ``substeps`` Runge–Kutta steps a sample.
 
-        ``substeps`` Runge–Kutta steps a sample; the error falls with their fourth power. The rest
-        as in the constructor.
+        The error falls with their fourth power. The rest as in the constructor.
         """
-        function("f", f, 2)
         dt = sample_time(dt)
-        got = _shape_of(
-            "f(x, u)",
-            f,
-            *(
-                jax.ShapeDtypeStruct((positive_int(name, size),), np.float64)
-                for name, size in (("nx", nx), ("nu", nu))
-            ),
-        )
+        got = traced_shape("f(x, u)", f, positive_int("nx", nx), positive_int("nu", nu))
         if got != (nx,):
             raise ValueError(f"f must return ẋ, shape ({nx},), got shape {got}")
         step = RungeKutta(f, dt / positive_int("substeps", substeps), substeps)
@@ -123,15 +108,11 @@ class NonlinearSystem(System):
 
     def step(self, x: Any, u: Any) -> Any:
         """Return x⁺ = f(x, u), shape (..., nx)."""
-        if is_traced(x) or is_traced(u):
-            return _batched(self.f, x, u)
-        return np.asarray(_step(self.f, x, u))
+        return to_numpy(_over_batch(self.f, real_array("x", x), real_array("u", u)))
 
     def output(self, x: Any) -> Any:
         """Return y = g(x), shape (..., ny)."""
-        if is_traced(x):
-            return _batched(self.g, x)
-        return np.asarray(_output(self.g, x))
+        return to_numpy(_over_batch(self.g, real_array("x", x)))
 
     def linearise(self, x: ArrayLike, u: ArrayLike) -> LinearSystem:
         """Return the plant near (x, u): deviations follow δx⁺ = A δx + B δu, δy = C δx.
@@ -156,15 +137,18 @@ def _state_itself(x: Any) -> Any:
     return x
 
 
-def _shape_of(name: str, call: Callable[..., Any], *arguments: Any) -> tuple[int, ...]:
-    try:
-        out = jax.eval_shape(call, *arguments)
-    except Exception as error:
-        raise ValueError(f"{name} must work on JAX arrays, but raised: {error}") from error
-    shape = getattr(out, "shape", None)
-    if shape is None:
+def traced_shape(name: str, call: Callable[..., Any], *sizes: int) -> tuple[int, ...]:
+    """Return the shape of what a user's function of vectors of these sizes makes under JAX.
+
+    ``name`` is the function with its arguments, such as "f(x, u)".
+    """
+    function(name.partition("(")[0], call, len(sizes))
+    vectors = (jax.ShapeDtypeStruct((size,), np.float64) for size in sizes)
+    with traced(name, Exception):
+        out = jax.eval_shape(lambda *given: call(*given), *vectors)  # JAX takes no ufunc
+    if not hasattr(out, "shape"):
         raise ValueError(f"{name} must return one array, got {type(out).__name__}")
-    return tuple(shape)
+    return tuple(out.shape)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -194,19 +178,10 @@ class RungeKutta:
         return x + h / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
-def _batched(call: Callable[..., Any], *arrays: Any) -> Any:
+@jax.jit(static_argnums=0, inline=True)
+def _over_batch(call: Callable[..., Any], *arrays: Any) -> Any:
     signature = ",".join("(n)" if i == 0 else "(m)" for i in range(len(arrays))) + "->(k)"
     return jnp.vectorize(call, signature=signature)(*arrays)
-
-
-@jax.jit(static_argnums=0)
-def _step(f: Dynamics, x: Any, u: Any) -> Any:
-    return _batched(f, x, u)
-
-
-@jax.jit(static_argnums=0)
-def _output(g: Callable[[Any], Any], x: Any) -> Any:
-    return _batched(g, x)
 
 
 @jax.jit(static_argnums=(0, 1))

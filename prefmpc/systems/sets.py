@@ -7,15 +7,9 @@ import dataclasses
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import (
-    bounds_pair,
-    finite,
-    finite_array,
-    nonnegative,
-    positive,
-    psd_matrix,
-    shaped,
-)
+from prefmpc._checks import bounds_pair, finite_array, nonnegative, positive, shaped
+from prefmpc._matrices import psd_matrix
+from prefmpc._pytree import set_fields
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
@@ -53,8 +47,7 @@ class Polyhedron:
         if (h == -np.inf).any():
             raise ValueError(f"h must be above minus infinity, got {h}")
         bounds = np.isfinite(h)
-        object.__setattr__(self, "H", H[bounds])
-        object.__setattr__(self, "h", h[bounds])
+        set_fields(self, H=H[bounds], h=h[bounds])
 
     @property
     def dim(self) -> int:
@@ -107,8 +100,8 @@ class Ellipsoid:
     level: float
 
     def __init__(self, P: ArrayLike, level: float = 1.0) -> None:
-        object.__setattr__(self, "P", psd_matrix("P", P, definite=True, stack=False))
-        object.__setattr__(self, "level", positive("level", level, allow_inf=True))
+        matrix = psd_matrix("P", P, definite=True, stack=False)
+        set_fields(self, P=matrix, level=positive("level", level, allow_inf=True))
 
     @property
     def dim(self) -> int:
@@ -151,14 +144,14 @@ class SecondOrderCone:
         m, n = matrix.shape
         if not m or not n:
             raise ValueError(f"F must have at least one row and one column, got {matrix.shape}")
-        vectors = {"g": (g, m), "c": (c, n)}
-        object.__setattr__(self, "F", matrix)
-        for name, (value, size) in vectors.items():
-            vector = np.zeros(size) if value is None else np.asarray(finite_array(name, value))
-            if vector.shape != (size,):
-                raise ValueError(f"{name} must have shape ({size},), got {vector.shape}")
-            object.__setattr__(self, name, vector)
-        object.__setattr__(self, "d", finite("d", d))
+        vectors = {}
+        for name, value, size in (("g", g, m), ("c", c, n)):
+            vectors[name] = np.asarray(
+                finite_array(name, np.zeros(size) if value is None else value)
+            )
+            if vectors[name].shape != (size,):
+                raise ValueError(f"{name} must have shape ({size},), got {vectors[name].shape}")
+        set_fields(self, F=matrix, d=float(finite_array("d", d, ndim=0)), **vectors)
 
     @property
     def dim(self) -> int:
