@@ -1,5 +1,7 @@
 # make book    the book as HTML: _build/html/index.html
 # make test    everything that must hold before a change is kept
+# make quick   lint, types and a few fast tests of every module, in a minute
+# make test-studies   the first draw of every study, whole, against what the book stores
 # make lab     JupyterLab on the notebooks
 # make notebooks   execute all notebooks again, in place
 # make bench   the times of the library beside its peers', in 8 minutes
@@ -25,15 +27,17 @@ export JAX_PLATFORMS ?= cpu
 # The matrices are small: threads would only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Dozens of processes import the same modules: each is compiled once, whatever the shell says.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: help book test lab notebooks bench clean lint types unit nbval unit-and-nbval html html-strict test-html
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | sed -n '1,9p'
+	@sed -n 's/^# \{0,1\}//p' Makefile | sed -n '1,11p'
 
-# The list is complete, so nothing has to be resolved; modules compile when first used.
-# The last line but one builds matplotlib's font cache, which would else write a message
-# into the first notebook that draws.
+# The list is complete, so nothing has to be resolved. The last line but one compiles what all
+# notebooks import (pip would compile everything), and builds matplotlib's font cache, which would
+# else write a message into the first notebook that draws.
 $(STAMP): requirements.txt pyproject.toml book/pyproject.toml
 	@if [ -z "$(PYTHON)" ] || ! "$(PYTHON)" -c '$(RECENT)' >/dev/null 2>&1; then \
 		echo "error: Python 3.11 or later was not found; name it: make PYTHON=/path/to/python" >&2; \
@@ -45,7 +49,8 @@ $(STAMP): requirements.txt pyproject.toml book/pyproject.toml
 	@$(BIN)/python -m pip install --quiet --no-deps --no-compile -r requirements.txt
 	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e . -e book
 	@$(BIN)/python -m pip check --quiet
-	@$(BIN)/python -c 'import matplotlib.font_manager' 2>/dev/null
+	@$(BIN)/python -W ignore -c 'import cvxpy, ipykernel.ipkernel, matplotlib.pyplot, studies' \
+		2>/dev/null
 	@touch $(STAMP)
 
 $(LAB_STAMP): $(STAMP)
