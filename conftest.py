@@ -32,6 +32,26 @@ import jax  # noqa: E402
 jax.config.update("jax_enable_x64", True)  # in this process; a notebook does it for itself
 
 
+# Files that take long, the longest first: workers that begin with them end together.
+LONGEST = """
+speed settling neural icnn stability lane training accuracy test_benchmarks test_loop_derivatives
+test_unstable_plants test_many_devices test_nonlinear_mpc test_priors_study test_references_study
+test_extension_studies test_signals_study test_measures_study test_training test_settling_study
+""".split()
+
+
+def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
+    """Share folders and lists of files among the processors; one file is not worth it."""
+    many = len(config.args) > 2 or any(Path(name).is_dir() for name in config.args)
+    return min(4, os.cpu_count() or 1) if many else 0
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Put the longest files first; the order within a file and of the others stays."""
+    place = {stem: k for k, stem in enumerate(LONGEST)}
+    items.sort(key=lambda item: place.get(item.path.stem, len(place)))
+
+
 def pytest_configure(config: pytest.Config) -> None:
     # The path in pyproject.toml is relative; make it independent of the current folder.
     rules = getattr(config.option, "nbval_sanitize_with", None)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 from studies import COLUMNS
 
+# A draw of every study takes ten minutes: a part of it does, unless all is asked for.
+WHOLE = os.environ.get("PREFMPC_STUDIES") == "all"
 BOOK = Path(__file__).parents[1] / "book"
 TIME = COLUMNS.index("time s")
 
