@@ -18,10 +18,15 @@ os.environ["SOURCE_DATE_EPOCH"] = "0"
 os.environ["PYTHONPATH"] = os.pathsep.join(
     [str(ROOT), str(ROOT / "book"), *filter(None, [os.environ.get("PYTHONPATH")])]
 )
+# Most of the time here would go into compiling programs that run once: XLA may do it quickly.
+# `XLA_FLAGS= make test` runs everything as the library's users do.
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+)
 # The same programs are compiled in many tests and notebooks: keep them between processes, in a
 # folder for each set of XLA's options. Only a cache of limited size is locked while it is read or
 # written (with the package filelock), so that two processes can share it.
-_setting = re.sub(r"\W+", "-", "xla " + os.environ.get("XLA_FLAGS", ""))
+_setting = re.sub(r"\W+", "-", "xla " + os.environ["XLA_FLAGS"])
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax" / _setting))
 os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(500_000_000))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
