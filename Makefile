@@ -1,5 +1,7 @@
 # make book    the book as HTML: _build/html/index.html
 # make test    everything that must hold before a change is kept
+# make quick   lint, types and a few fast tests of every module, in a minute
+# make test-studies   more of each study's first draw again than `make test` does
 # make lab     JupyterLab on the notebooks
 # make notebooks   execute all notebooks again, in place
 # make bench   the times of the library beside its peers', in 8 minutes
@@ -15,6 +17,10 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 LAB_STAMP := $(VENV)/.installed-lab
 HTML := _build/html
+PYTEST := $(BIN)/python -m pytest -q
+# A fast test file of each part of the library; `malformed_inputs` calls everything public.
+QUICK := systems trajectories preferences comparisons pools models loss minimise plots files \
+	malformed_inputs convex_mpc terminal package notebooks spread_files
 
 # The first interpreter on the PATH that is recent enough; `make PYTHON=... book` overrides.
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
@@ -25,15 +31,17 @@ export JAX_PLATFORMS ?= cpu
 # The matrices are small: threads would only wait for each other.
 export OPENBLAS_NUM_THREADS ?= 1
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
+# Dozens of processes import the same modules: each is compiled once, whatever the shell says.
+unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help book test lab notebooks bench clean lint types unit nbval unit-and-nbval html html-strict test-html
+.PHONY: help book test quick test-studies lab notebooks bench clean lint types unit nbval unit-and-nbval html html-strict test-html
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | sed -n '1,9p'
+	@sed -n 's/^# \{0,1\}//p' Makefile | sed -n '1,11p'
 
-# The list is complete, so nothing has to be resolved; modules compile when first used.
-# The last line but one builds matplotlib's font cache, which would else write a message
-# into the first notebook that draws.
+# The list is complete, so nothing has to be resolved. The last line but one compiles what all
+# notebooks import (pip would compile everything), and builds matplotlib's font cache, which would
+# else write a message into the first notebook that draws.
 $(STAMP): requirements.txt pyproject.toml book/pyproject.toml
 	@if [ -z "$(PYTHON)" ] || ! "$(PYTHON)" -c '$(RECENT)' >/dev/null 2>&1; then \
 		echo "error: Python 3.11 or later was not found; name it: make PYTHON=/path/to/python" >&2; \
@@ -45,7 +53,8 @@ $(STAMP): requirements.txt pyproject.toml book/pyproject.toml
 	@$(BIN)/python -m pip install --quiet --no-deps --no-compile -r requirements.txt
 	@$(BIN)/python -m pip install --quiet --no-deps --no-build-isolation -e . -e book
 	@$(BIN)/python -m pip check --quiet
-	@$(BIN)/python -c 'import matplotlib.font_manager' 2>/dev/null
+	@$(BIN)/python -W ignore -c 'import cvxpy, ipykernel.ipkernel, matplotlib.pyplot, studies' \
+		2>/dev/null
 	@touch $(STAMP)
 
 $(LAB_STAMP): $(STAMP)
@@ -78,6 +87,13 @@ test: $(STAMP)
 	@$(MAKE) --no-print-directory test-html unit-and-nbval
 	@echo "All checks passed: lint, types, unit tests, notebooks, HTML."
 
+quick: $(STAMP)
+	@$(MAKE) --no-print-directory --jobs=2 --output-sync=target lint types
+	@$(PYTEST) $(QUICK:%=tests/test_%.py)
+
+test-studies: $(STAMP)
+	@PREFMPC_STUDIES=all $(PYTEST) $(wildcard tests/test_*_study.py tests/test_*_studies.py)
+
 lint: $(STAMP)
 	@$(BIN)/ruff check --quiet .
 	@$(BIN)/ruff format --check --quiet --exclude '*.ipynb' .
@@ -86,14 +102,14 @@ types: $(STAMP)
 	@$(BIN)/mypy --no-error-summary
 
 unit: $(STAMP)
-	@$(BIN)/python -m pytest -q -n 2 --dist loadfile
+	@$(PYTEST)
 
 # Both in one run, so that no worker waits for the other at the end of the first.
 unit-and-nbval: $(STAMP)
-	@$(BIN)/python -m pytest -q -n 2 --dist loadfile --nbval book/ tests/
+	@$(PYTEST) --nbval book/ tests/
 
 nbval: $(STAMP)
-	@$(BIN)/python -m pytest -q -n 2 --dist loadfile --nbval book/
+	@$(PYTEST) --nbval book/
 
 # From scratch: an incremental build does not repeat the warnings of unchanged pages.
 html-strict: $(STAMP)
@@ -101,7 +117,7 @@ html-strict: $(STAMP)
 	@$(BIN)/jupyter-book build --quiet . -W -n --keep-going
 
 test-html: $(STAMP)
-	@$(BIN)/python -m pytest -q tests/html
+	@$(PYTEST) -n 0 tests/html
 
 clean:
 	@rm -rf $(VENV) _build build dist ./*.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis .cache

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import jax
-import malformed_calls as calls
+import malformed_samples as sound
 import numpy as np
 import scipy.sparse as sp
 
@@ -52,24 +52,24 @@ ANYTHING = {
     "says a matrix": lambda *_: np.ones((3, 3)),
     "says NaN": lambda *_: np.nan,
     "class": p.QuadraticCost,
-    "plant": calls.SYSTEM,
-    "plants": p.LinearSystem.stack([calls.SYSTEM, calls.SYSTEM]),
+    "plant": sound.SYSTEM,
+    "plants": p.LinearSystem.stack([sound.SYSTEM, sound.SYSTEM]),
     "larger plant": p.LinearSystem(np.eye(3), np.eye(3), dt=0.1),
-    "nonlinear plant": calls.CAR,
-    "cost": calls.COST,
+    "nonlinear plant": sound.CAR,
+    "cost": sound.COST,
     "costs": p.QuadraticCost(np.stack([np.eye(2)] * 2), np.ones((2, 1, 1))),
     "larger cost": p.QuadraticCost(np.eye(3), np.eye(3)),
-    "network": calls.ICNN,
-    "trajectory": calls.POOL[0],
-    "pool": calls.POOL,
+    "network": sound.ICNN,
+    "trajectory": sound.POOL[0],
+    "pool": sound.POOL,
     "shorter pool": p.Trajectory(np.ones((5, 2, 3)), np.ones((5, 1, 2))),
-    "failed pool": jax.tree.map(lambda leaf: leaf * np.nan, calls.POOL[:2]),
-    "polyhedron": calls.LIMITS,
+    "failed pool": jax.tree.map(lambda leaf: leaf * np.nan, sound.POOL[:2]),
+    "polyhedron": sound.LIMITS,
     "ellipsoid": p.Ellipsoid(np.eye(3)),
-    "comparisons": calls.DATA,
-    "prior": calls.PRIOR,
-    "key": calls.KEY,
-    "keys": jax.random.split(calls.KEY, 2),
+    "comparisons": sound.DATA,
+    "prior": sound.PRIOR,
+    "key": sound.KEY,
+    "keys": jax.random.split(sound.KEY, 2),
 }
 
 

@@ -293,22 +293,6 @@ def test_only_a_small_finite_decrement_is_a_minimum(monkeypatch, place, bad):
         choose_prior(CLEAN, [BRYSON])
 
 
-@pytest.mark.parametrize("bad", [1.0, np.nan, np.inf])
-@pytest.mark.parametrize("place", ["decrement", "log_evidence"])
-def test_only_evidence_at_a_mode_counts(monkeypatch, place, bad):
-    true = selection.laplaces
-
-    def broken(*arguments):
-        return [found._replace(**{place: bad}) for found in true(*arguments)]
-
-    monkeypatch.setattr(selection, "laplaces", broken)
-    if (place, bad) == ("log_evidence", 1.0):
-        assert choose_prior(CLEAN, [BRYSON]).scores[0] == 1.0
-        return
-    with pytest.raises(FitError, match="1 of 1 evidences were not found"):
-        choose_prior(CLEAN, [BRYSON])
-
-
 @pytest.mark.parametrize(
     ("call", "words"),
     [

@@ -311,18 +311,13 @@ def test_same_starts_whatever_the_unit(unit):
         (lambda: win_rate(prefers_less, TWO, TWO[0]), r"second must have shape \(m,\), got \(\)"),
         (lambda: win_rate(prefers_less, TWO, SHIFTED), "second must start in the same states"),
         (lambda: win_rate(prefers_less, TWO, TWO[:1]), "second must start in the same states"),
-        (
-            lambda: win_rate(prefers_less, TWO, TWO, confidence=1),
-            r"confidence must lie in \(0, 1\)",
-        ),
-        (
-            lambda: win_rate(prefers_less, TWO, TWO, confidence=0),
-            r"confidence must lie in \(0, 1\)",
-        ),
-        (
-            lambda: win_rate(prefers_less, TWO, TWO, confidence=-1),
-            r"confidence must lie in \(0, 1\)",
-        ),
+        *[
+            (
+                lambda share=share: win_rate(prefers_less, TWO, TWO, confidence=share),
+                r"confidence must lie in \(0, 1\)",
+            )
+            for share in (1, 0, -1)
+        ],
         (lambda: win_rate(prefers_less, TWO, TWO, confidence="1"), "confidence must be a number"),
         (lambda: simulate("plant", still, RADIUS, 2), "system must be a System, got str"),
         (lambda: simulate(MASSES, still, RADIUS[:5], 2), r"x0 must have shape \(..., 6\)"),

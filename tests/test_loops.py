@@ -1,15 +1,8 @@
-"""Closed loops by the thousand, against one solve at a time; their derivatives; many devices."""
+"""Closed loops by the thousand, against one solve at a time."""
 
 from __future__ import annotations
 
-import os
-import socket
-import subprocess
-import sys
-from pathlib import Path
-
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -37,7 +30,6 @@ OTHER = QuadraticCost(np.eye(6), 0.1 * np.eye(2))
 STATES = np.asarray(random_states(RADIUS, key=KEY, shape=(12,)))
 # Speed limits of two masses; half of the states are too energetic for them.
 LIMITS = Polyhedron(np.eye(8)[[3, 4, 4]] * [[1], [1], [-1]], [0.3] * 3)
-SLOW = [0, 4, 8, 9, 10]
 N, STEPS = 8, 6
 
 
@@ -129,118 +121,6 @@ def test_many_models_and_many_plants():
             expected = simulate(plant, LinearMPC(model, PAPER, N), STATES[:2], STEPS)
             np.testing.assert_allclose(found.trajectories.x[i], expected.x, rtol=0, atol=1e-5)
             np.testing.assert_allclose(found.trajectories.y[i], expected.y, rtol=0, atol=1e-5)
-
-
-def person(T):
-    """What the controller does not know: force counts twice as much as it thinks."""
-    x, u = T.x[..., :-1, :], T.u
-    return jnp.einsum("...kx,...kx->...", x, x) + 2 * jnp.einsum("...ku,...ku->...", u, u)
-
-
-CALM = STATES[SLOW]
-
-
-@pytest.mark.parametrize("constraints", [None, LIMITS])
-def test_derivatives_are_those_of_finite_differences(constraints):
-    @jax.jit
-    def performance(cost, x0):
-        T = mpc_rollout(MASSES, cost, x0, horizon=N, steps=STEPS, constraints=constraints)
-        return person(T).mean()
-
-    plain = closed_loops(MASSES, PAPER, CALM, horizon=N, steps=STEPS, constraints=constraints)
-    assert float(performance(PAPER, CALM)) == pytest.approx(person(plain.trajectories).mean())
-    saturated = np.abs(plain.trajectories.u) > 1 - 1e-9
-    at_limit = np.abs(np.abs(plain.trajectories.x[..., 3:5]) - 0.3) < 1e-6
-    assert saturated.any()
-    assert at_limit.any() == (constraints is not None)
-
-    slopes = jax.jit(jax.grad(performance, argnums=(0, 1)))(PAPER, CALM)
-    rng = np.random.default_rng(0)
-    for _ in range(3):
-        way = jax.tree.map(lambda leaf: rng.normal(size=leaf.shape), (PAPER, CALM))
-
-        ahead = jax.tree.map(lambda a, b: a + 1e-6 * b, (PAPER, CALM), way)
-        behind = jax.tree.map(lambda a, b: a - 1e-6 * b, (PAPER, CALM), way)
-        expected = (performance(*ahead) - performance(*behind)) / 2e-6
-        pairs = zip(jax.tree.leaves(slopes), jax.tree.leaves(way), strict=True)
-        assert sum(np.vdot(a, b) for a, b in pairs) == pytest.approx(float(expected), rel=1e-5)
-        forward = jax.jvp(performance, (PAPER, CALM), way)[1]
-        assert float(forward) == pytest.approx(float(expected), rel=1e-5)
-
-
-DEVICES = """
-import sys
-import numpy as np, jax
-if len(sys.argv) > 1:
-    jax.distributed.initialize(f"127.0.0.1:{sys.argv[1]}", 2, int(sys.argv[2]))
-jax.config.update("jax_enable_x64", True)
-import prefmpc as p
-from studies import QUADRATIC_Q, QUADRATIC_R, RADIUS
-system, cost = p.oscillating_masses(), p.QuadraticCost(QUADRATIC_Q, QUADRATIC_R)
-mesh = jax.make_mesh((jax.device_count(),), ("devices",))
-assert mesh.size == COUNT, mesh
-worst = []
-
-def compare(ours, theirs):
-    for a, b in zip(jax.tree.leaves(ours), jax.tree.leaves(theirs), strict=True):
-        assert a.shape == b.shape
-        np.testing.assert_array_equal(np.isnan(a), np.isnan(b))
-        worst.append(np.nanmax(np.abs(a - b)))
-
-def loops(costs, x0, **options):
-    return p.closed_loops(system, costs, x0, horizon=5, steps=4, **options)
-
-x0 = np.asarray(p.random_states(RADIUS, key=jax.random.key(5), shape=(21,)))
-stack = p.QuadraticCost.random(6, 2, key=jax.random.key(1), shape=(11,))
-cases = [(cost, x0, {}), (stack, x0[:1], {})]
-if COUNT == 8:
-    cases.append((cost, x0, {"constraints": p.Polyhedron(np.eye(8)[[3, 4]], [0.3, 0.3])}))
-for costs, states, options in cases:
-    alone, shared = loops(costs, states, **options), loops(costs, states, mesh=mesh, **options)
-    compare(alone.trajectories, shared.trajectories)
-    np.testing.assert_array_equal(alone.codes, shared.codes)
-assert COUNT == 2 or not alone.solved.all()
-
-pool = p.lqr_pool(system, 40, 10, key=jax.random.key(0), radius=RADIUS, saturate=False)
-person = p.QuadraticPreference(QUADRATIC_Q, QUADRATIC_R)
-data = p.Comparisons.random(pool, person, 6000, key=jax.random.key(1))
-prior = p.bryson(RADIUS, [1, 1])
-alone, shared = p.fit_map(data, prior), p.fit_map(data, prior, mesh=mesh)
-assert shared.success
-compare((alone.Q, alone.R), (shared.Q, shared.R))
-print("worst", max(worst))
-"""
-
-
-def devices(count, *arguments):
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[1])}
-    if not arguments:
-        environment["XLA_FLAGS"] = f"--xla_force_host_platform_device_count={count}"
-    return subprocess.Popen(
-        [sys.executable, "-c", DEVICES.replace("COUNT", str(count)), *arguments],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        env=environment,
-    )
-
-
-def worst_of(process):
-    out, err = process.communicate(timeout=240)
-    assert process.returncode == 0, err[-3000:]
-    return float(out.split("worst")[1])
-
-
-def test_eight_devices_say_what_one_says():
-    assert worst_of(devices(8)) <= 1e-10
-
-
-def test_two_processes_say_what_one_says():
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = str(free.getsockname()[1])
-    both = [devices(2, port, str(i)) for i in range(2)]
-    assert max(map(worst_of, both)) <= 1e-10
 
 
 def loops(system=MASSES, costs=PAPER, x0=RADIUS[None], horizon=2, steps=2, **options):

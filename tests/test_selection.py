@@ -8,6 +8,7 @@ import pytest
 
 from prefmpc import (
     Comparisons,
+    FitError,
     QuadraticCost,
     bryson,
     choose_prior,
@@ -16,6 +17,7 @@ from prefmpc import (
     lqr_pool,
     oscillating_masses,
 )
+from prefmpc.learning import selection
 from studies import RADIUS
 
 POOL = lqr_pool(
@@ -67,6 +69,22 @@ def test_answers_that_say_nothing_have_the_evidence_of_a_coin():
     scores = choose_prior(nothing, PRIORS).scores
     # Laplace's method is not exact for the prior itself: the gammas of weak ones are skewed.
     assert (np.abs(scores + 2 * np.log(2)) < [0.6, 0.1] * 3).all()
+
+
+@pytest.mark.parametrize("bad", [1.0, np.nan, np.inf])
+@pytest.mark.parametrize("place", ["decrement", "log_evidence"])
+def test_only_evidence_at_a_mode_counts(monkeypatch, place, bad):
+    true = selection.laplaces
+
+    def broken(*arguments):
+        return [found._replace(**{place: bad}) for found in true(*arguments)]
+
+    monkeypatch.setattr(selection, "laplaces", broken)
+    if (place, bad) == ("log_evidence", 1.0):
+        assert choose_prior(ANSWERS, [TRUE]).scores[0] == 1.0
+        return
+    with pytest.raises(FitError, match="1 of 1 evidences were not found"):
+        choose_prior(ANSWERS, [TRUE])
 
 
 @pytest.mark.parametrize(
