@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-import warnings
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -28,6 +27,7 @@ from prefmpc._checks import (
     require_x64,
     share,
 )
+from prefmpc._results import Result, warn_of_failure
 from prefmpc._sharding import check_mesh
 from prefmpc.learning._newton import (
     Entries,
@@ -38,7 +38,7 @@ from prefmpc.learning._newton import (
     solve,
     solve_shared,
 )
-from prefmpc.learning.losses import FitError, padded_size
+from prefmpc.learning.losses import padded_size
 from prefmpc.learning.priors import Structure, WishartPrior, free_entries
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.preferences.comparisons import Comparisons
@@ -56,7 +56,7 @@ class Interval(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class MapResult:
+class MapResult(Result):
     """The most probable (Q, R) after the answers.
 
     Attributes
@@ -79,6 +79,8 @@ class MapResult:
         What was asked.
     """
 
+    NAME = "fit_map"
+
     Q: np.ndarray
     R: np.ndarray
     status: Status
@@ -95,19 +97,9 @@ class MapResult:
     minimum: Minimum = dataclasses.field(repr=False)
 
     @property
-    def success(self) -> bool:
-        """Whether the decrement certifies the minimum."""
-        return self.status == "converged"
-
-    @property
     def message(self) -> str:
         """One sentence on how it went."""
         return f"{self.status} after {self.iterations} Newton steps, decrement {self.decrement:.1e}"
-
-    def check(self) -> None:
-        """Raise a `FitError` unless the minimum was reached."""
-        if not self.success:
-            raise FitError(f"fit_map: {self.message}")
 
     @property
     def model(self) -> QuadraticCost:
@@ -238,7 +230,7 @@ def fit_map(
     instance("prior", prior, WishartPrior)
     mesh = None if mesh is None else check_mesh(mesh)
     results = _solved([comparisons], [prior], structure, outputs, max_iterations, tol, mesh)
-    _warn_of_failures(results)
+    warn_of_failure(results[0])
     return results[0]
 
 
@@ -265,7 +257,9 @@ def fit_maps(
     """
     data_sets, beliefs = _paired(comparisons, priors)
     results = _solved(data_sets, beliefs, structure, outputs, max_iterations, tol)
-    _warn_of_failures(results)
+    if bad := [result for result in results if not result.success]:
+        many = f" ({len(bad)} of {len(results)} problems)" if len(results) > 1 else ""
+        warn_of_failure(bad[0], many)
     return results
 
 
@@ -316,13 +310,6 @@ def _solved(
             )
         )
     return results
-
-
-def _warn_of_failures(results: list[MapResult]) -> None:
-    """Warn the caller of the public function that called this one."""
-    if bad := [result for result in results if not result.success]:
-        many = f" ({len(bad)} of {len(results)} problems)" if len(results) > 1 else ""
-        warnings.warn(f"fit_map: {bad[0].message}{many}", RuntimeWarning, stacklevel=3)
 
 
 def new_gaps(

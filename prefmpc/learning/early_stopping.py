@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-import warnings
 from typing import Any
 
 import jax
@@ -13,8 +12,8 @@ import numpy as np
 
 from prefmpc._checks import flag, instance, nonnegative, positive_int, require_x64, share, to_numpy
 from prefmpc._random import generator
+from prefmpc._results import FitError, Restarts, warn_of_failure
 from prefmpc.learning.losses import (
-    FitError,
     PairData,
     cross_entropy,
     objective,
@@ -29,7 +28,7 @@ CHECK_EVERY = 10
 
 
 @dataclasses.dataclass(frozen=True)
-class NetworkFit:
+class NetworkFit(Restarts):
     """Restarts of `fit_network`, each at its best moment, and which one was chosen.
 
     Attributes
@@ -51,6 +50,8 @@ class NetworkFit:
     seconds : float
     """
 
+    NAME = "fit_network"
+
     models: Any
     chosen: int | None
     validation_loss: np.ndarray
@@ -59,11 +60,6 @@ class NetworkFit:
     best: np.ndarray
     status: np.ndarray
     seconds: float
-
-    @property
-    def success(self) -> bool:
-        """Whether at least one restart stayed finite."""
-        return self.chosen is not None
 
     @property
     def message(self) -> str:
@@ -78,12 +74,8 @@ class NetworkFit:
             f"validation loss {loss:.4g}"
         )
 
-    @property
-    def model(self) -> Any:
-        """The chosen model. Raises a `FitError` if there is none."""
-        if self.chosen is None:
-            raise FitError(f"{self.message}. The models as they were are in .models")
-        return jax.tree.map(lambda leaf: leaf[self.chosen], self.models)
+    def _error(self) -> FitError:
+        return FitError(f"{self.message}. The models as they were are in .models")
 
 
 def fit_network(
@@ -185,8 +177,7 @@ def fit_network(
         status=status,
         seconds=time.perf_counter() - began,
     )
-    if not result.success:
-        warnings.warn(f"fit_network: {result.message}", RuntimeWarning, stacklevel=2)
+    warn_of_failure(result)
     return result
 
 

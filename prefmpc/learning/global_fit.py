@@ -13,8 +13,9 @@ import numpy as np
 import scipy.special
 
 from prefmpc._checks import choice, instance, positive, require_x64, to_numpy
+from prefmpc._results import Result, warn_of_failure
 from prefmpc.learning._newton import Entries, loss, loss_and_slopes, second_order
-from prefmpc.learning.losses import FitError, PairData, padded_size, pair_data
+from prefmpc.learning.losses import PairData, padded_size, pair_data
 from prefmpc.models.quadratic import DIAGONAL_MIN, QuadraticCost, _semidefinite_factor
 from prefmpc.preferences.comparisons import Comparisons
 
@@ -32,7 +33,7 @@ TOLERANCES = {
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class GlobalResult:
+class GlobalResult(Result):
     """The global minimum of eq. (6) over (Q, R).
 
     Attributes
@@ -51,6 +52,8 @@ class GlobalResult:
         Wall time, compilation included if there was one.
     """
 
+    NAME = "fit_global"
+
     Q: np.ndarray
     R: np.ndarray
     objective: float
@@ -60,11 +63,6 @@ class GlobalResult:
     seconds: float
 
     @property
-    def success(self) -> bool:
-        """Whether the solver certifies the minimum."""
-        return self.status == "converged"
-
-    @property
     def message(self) -> str:
         """One sentence on how it went."""
         return f"{self.status} after {self.iterations} steps, gap {self.gap:.1e}"
@@ -72,8 +70,7 @@ class GlobalResult:
     @property
     def model(self) -> QuadraticCost:
         """The learned σ. Raises a `FitError` unless the minimum was reached."""
-        if not self.success:
-            raise FitError(f"fit_global: {self.message}")
+        self.check()
         return QuadraticCost(self.Q, self.R)
 
 
@@ -135,8 +132,7 @@ def fit_global(
         iterations=steps,
         seconds=time.perf_counter() - began,
     )
-    if not result.success:
-        warnings.warn(f"fit_global: {result.message}", RuntimeWarning, stacklevel=2)
+    warn_of_failure(result)
     return result
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-import warnings
 from functools import partial
 from typing import Any, Literal, get_args
 
@@ -23,9 +22,9 @@ from prefmpc._checks import (
     to_numpy,
 )
 from prefmpc._random import generator
+from prefmpc._results import FitError, Restarts, warn_of_failure
 from prefmpc.learning._lbfgsb import minimise
 from prefmpc.learning.losses import (
-    FitError,
     PairData,
     cross_entropy,
     logits,
@@ -44,7 +43,7 @@ BOUND_ROUNDING = 1e-9
 
 
 @dataclasses.dataclass(frozen=True)
-class FitResult:
+class FitResult(Restarts):
     """What came of every restart, and which one was chosen.
 
     Attributes
@@ -70,6 +69,8 @@ class FitResult:
         Wall time, compilation included if there was one.
     """
 
+    NAME = "fit"
+
     models: Any
     chosen: int | None
     selection: Selection
@@ -83,11 +84,6 @@ class FitResult:
     seconds: float
 
     @property
-    def success(self) -> bool:
-        """Whether at least one restart converged to finite weights within the bounds."""
-        return self.chosen is not None
-
-    @property
     def message(self) -> str:
         """One sentence on how it went."""
         counts = {name: int((self.status == name).sum()) for name in get_args(Status)}
@@ -95,14 +91,10 @@ class FitResult:
         how = f"restart {self.chosen} chosen by {self.selection}" if self.success else "none usable"
         return f"{self.status.size} restarts: {seen}; {how}"
 
-    @property
-    def model(self) -> Any:
-        """The chosen model. Raises a `FitError` if no restart may be used."""
-        if self.chosen is None:
-            raise FitError(
-                f"{self.message}. The models as they stopped are in .models, the reasons in .status"
-            )
-        return jax.tree.map(lambda leaf: leaf[self.chosen], self.models)
+    def _error(self) -> FitError:
+        return FitError(
+            f"{self.message}. The models as they stopped are in .models, the reasons in .status"
+        )
 
 
 def fit(
@@ -201,8 +193,7 @@ def fit(
         bound_violation=violation,
         seconds=time.perf_counter() - began,
     )
-    if not result.success:
-        warnings.warn(f"fit: {result.message}", RuntimeWarning, stacklevel=2)
+    warn_of_failure(result)
     return result
 
 

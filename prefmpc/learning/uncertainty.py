@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-import warnings
 from typing import Any, NamedTuple
 
 import jax
@@ -13,6 +12,7 @@ import numpy as np
 
 from prefmpc._checks import instance, is_whole, positive_int, to_numpy
 from prefmpc._random import generator
+from prefmpc._results import Result, warn_of_failure
 from prefmpc.learning._chart import Chart, Laplace, laplaces, minus_log_posterior
 from prefmpc.learning.convex import Interval, MapResult, new_gaps, split
 from prefmpc.models.quadratic import QuadraticCost
@@ -33,7 +33,7 @@ SMALLEST_SHARE = 0.1
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Posterior:
+class Posterior(Result):
     """Equally probable (Q, R) after the answers.
 
     Attributes
@@ -51,6 +51,8 @@ class Posterior:
     result : MapResult
         Whose posterior this is.
     """
+
+    NAME = "posterior: the chains disagree"
 
     Q: np.ndarray
     R: np.ndarray
@@ -162,10 +164,7 @@ def posterior(result: MapResult, *, draws: int = 1024, key: Any = 0) -> Posterio
         result=result,
         w=flat,
     )
-    if not out.success:
-        warnings.warn(
-            f"posterior: the chains disagree: {out.message}", RuntimeWarning, stacklevel=2
-        )
+    warn_of_failure(out)
     return out
 
 
