@@ -9,12 +9,13 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import expit
 
-from prefmpc._checks import instance, is_whole, positive_int, to_numpy
+from prefmpc._checks import instance, is_whole, positive_int, share, to_numpy
 from prefmpc._random import generator
 from prefmpc._results import Result, warn_of_failure
 from prefmpc.learning._chart import Chart, Laplace, laplaces, minus_log_posterior
-from prefmpc.learning.convex import Interval, MapResult, new_gaps, split
+from prefmpc.learning.convex import Interval, MapResult
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.preferences.trajectories import Trajectory
 
@@ -106,10 +107,9 @@ class Posterior(Result):
         Interval
             Three arrays (...). The mean is the probability to bet on.
         """
-        gap, batch, tail = new_gaps(self.result, first, second, level)
-        P = 0.5 * (1 + np.tanh(0.5 * (self.w @ gap)))
-        lower, upper = np.quantile(P, [tail, 1 - tail], axis=0)
-        return Interval(*(part.reshape(batch) for part in (P.mean(axis=0), lower, upper)))
+        tail = (1 - share("level", level)) / 2
+        P = expit(np.tensordot(self.w, self.result.gaps(first, second), 1))
+        return Interval(P.mean(axis=0), *np.quantile(P, [tail, 1 - tail], axis=0))
 
 
 def posterior(result: MapResult, *, draws: int = 1024, key: Any = 0) -> Posterior:
@@ -154,7 +154,7 @@ def posterior(result: MapResult, *, draws: int = 1024, key: Any = 0) -> Posterio
     w, acceptance = to_numpy(_sample(chart, mode, noise, *data))
     w, acceptance = w[WARM_UP:], acceptance[WARM_UP:]
     flat = w.reshape(-1, p)
-    Q, R = split(problem.in_user_units(flat), len(result.prior.Q), result.outputs)
+    Q, R = problem.costs(flat)
     out = Posterior(
         Q=Q,
         R=R,
