@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import expit
 
-from prefmpc._checks import instance, is_whole, positive_int, share, to_numpy
+from prefmpc._checks import instance, positive_int, share, to_numpy
 from prefmpc._random import generator
 from prefmpc._results import Result, warn_of_failure
 from prefmpc.learning._chart import Chart, Laplace, laplaces, minus_log_posterior
@@ -93,19 +93,9 @@ class Posterior(Result):
         return self.R.std(axis=0)
 
     def probability(self, first: Trajectory, second: Trajectory, level: float = 0.9) -> Interval:
-        """Return P(first is preferred), and how sure we are of that probability.
+        """Return P(first is preferred), and how sure we are of that: see `MapResult.probability`.
 
-        Parameters
-        ----------
-        first, second : Trajectory
-            With equal batch shapes (...).
-        level : float
-            The share of the posterior between the bounds, with equal shares outside.
-
-        Returns
-        -------
-        Interval
-            Three arrays (...). The mean is the probability to bet on.
+        The mean (...) is the probability to bet on.
         """
         tail = (1 - share("level", level)) / 2
         P = expit(np.tensordot(self.w, self.result.gaps(first, second), 1))
@@ -124,7 +114,7 @@ def posterior(result: MapResult, *, draws: int = 1024, key: Any = 0) -> Posterio
         Its structure must be block-diagonal, or such that its Cholesky factor has the same zeros.
     draws : int
         Number of samples, rounded up to a multiple of 32, at least 256.
-    key : JAX random key, NumPy generator or whole number
+    key : JAX random key or int
         The same key gives the same samples. Another one shows the error of sampling.
 
     Raises
@@ -141,7 +131,7 @@ def posterior(result: MapResult, *, draws: int = 1024, key: Any = 0) -> Posterio
     problem = result.problem
     chart = Chart.of(problem)
     mode = laplaces([problem], [result.minimum.w])[0]
-    rng = np.random.default_rng(key) if is_whole(key) and key >= 0 else generator(key)
+    rng = generator(key)
     p, total = mode.eta.size, WARM_UP + steps
     noise = Noise(
         rng.standard_normal((CHAINS, p)),
