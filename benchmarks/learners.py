@@ -19,7 +19,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import minimize
 
 import prefmpc
-from prefmpc.learning import training
+from prefmpc.learning._starts import projected_adam
 
 LOWER = 1e-6
 """Least diagonal entry of a Cholesky factor, relative to the prior's: W stays definite."""
@@ -154,7 +154,7 @@ def jaxopt_recipe(
     @jax.jit
     def train(start: prefmpc.QuadraticCost) -> Any:
         bounds = start.bounds()
-        warm = training._projected_adam(loss, start, *bounds, 200, 0.01)
+        warm = projected_adam(loss, start, bounds, 200, 0.01)
         return loss(solver.run(warm, bounds=bounds).params)
 
     return lambda: min(float(train(starts[i])) for i in range(len(starts.theta)))

@@ -30,7 +30,8 @@ from loops import HORIZON, MINI, Case, Sizes
 from measure import median, show
 
 import prefmpc
-from prefmpc.learning import _newton, convex
+from prefmpc.learning import _newton, _problem
+from prefmpc.learning.losses import padded_size
 from prefmpc.mpc.batched import controllers, starts
 from prefmpc.mpc.loops import _program
 
@@ -135,13 +136,13 @@ def loops(case: Case, speed: dict[str, float], repeats: int) -> dict[str, Any]:
 def learning_step(n: int, speed: dict[str, float], repeats: int) -> dict[str, Any]:
     """`fit_map` from n comparisons: floors, and where the time goes."""
     data, prior = learning.data_of(learning.pool_of(200), n), prefmpc.bryson(*learning.PRIOR)
-    _, entries = convex.check([data], [prior], "full", None)
-    size = convex.padded_size(n)
-    problems = _newton.build(data, [prior], entries, None, size)
+    _, entries = _problem.check([data], [prior], "full", None)
+    size = padded_size(n)
+    problems = _problem.build(data, [prior], entries, None, size)
     p = len(entries.rows)
     steps = prefmpc.fit_map(data, prior).iterations
     seconds = median(lambda: prefmpc.fit_map(data, prior), repeats)
-    build = median(lambda: _newton.build(data, [prior], entries, None, size), repeats)
+    build = median(lambda: _problem.build(data, [prior], entries, None, size), repeats)
     newton = median(lambda: _newton.solve(problems, 1e-8, 100), repeats)
     flops = steps * size * (2.0 * p * (p + 1) + 5 * p)
     counts = {"flops": flops, "bytes": steps * size * 8.0 * (2 * p + 10)}

@@ -166,8 +166,7 @@ negative, with 1e308, with inf | h
 deeper, with 1e308 | SeparableCost: c
 failed pool, pool, trajectory | trajectory
 deeper, empty, flatter, longer, negative, with 1e308 | rollout: x0
-key | key
-0, 10^30, 10^400, key | posterior: key
+0, 10^30, 10^400, key | key
 says NaN | ask
 pool, shorter pool | trajectories
 pool | Comparisons.random: trajectories

@@ -139,7 +139,7 @@ MASSES = oscillating_masses()
         (lambda: random_weights(1, 1, key=KEY, coupling=-1), "coupling must be finite and at"),
         (lambda: random_states([-1.0], key=KEY), "radius must not be negative"),
         (lambda: random_states([np.nan], key=KEY), "radius must be finite"),
-        (lambda: random_states([1.0], key=0), "key must be a single JAX random key.*got int"),
+        (lambda: random_states([1.0], key=-1), "key must be a single JAX random key.*got -1"),
         (lambda: random_states(1.0, key=KEY), "radius must have 1 dimension"),
         (lambda: lqr_pool(MASSES, 0, 5, key=KEY, radius=np.ones(6)), "size must be a whole"),
         (lambda: lqr_pool(MASSES, 2, 0, key=KEY, radius=np.ones(6)), "steps must be a whole"),
@@ -165,7 +165,7 @@ MASSES = oscillating_masses()
         (lambda: lqr_pool(MASSES, 2, 5, key=KEY, x0=np.ones((2, 5))), "x0 must have shape"),
         (lambda: lqr_pool(MASSES, 2, 5, key=KEY, x0=np.ones(6)), "x0 must have shape"),
         (lambda: lqr_pool(MASSES, 1, 5, key=KEY, x0=np.full((1, 6), np.nan)), "x0 must be finite"),
-        (lambda: lqr_pool(MASSES, 2, 5, key=0, radius=np.ones(6)), "key must be a single JAX"),
+        (lambda: lqr_pool(MASSES, 2, 5, key=0.5, radius=np.ones(6)), "key must be a single JAX"),
     ],
 )
 def test_bad_input_is_named(call, words):

@@ -12,7 +12,7 @@ from few_comparisons import COST, FEW, POOL, Distance
 from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize
 
-from prefmpc import Comparisons, FitError, QuadraticCost, accuracy, fit
+from prefmpc import Comparisons, FitError, ICNNCost, QuadraticCost, accuracy, fit
 from prefmpc.learning import training
 from prefmpc.learning.losses import cross_entropy, objective, pair_data
 from studies import error_rates
@@ -243,6 +243,26 @@ def test_no_warning_on_the_way_to_a_good_fit(data):
         fit(data[2][20], key=KEY)
 
 
+@pytest.mark.parametrize(("n", "fraction"), [(1, 0.2), (4, 0.9)])
+def test_too_few_pairs_to_keep_some_out(n, fraction):
+    few = FEW.subset(np.arange(n))
+    with pytest.warns(RuntimeWarning, match=rf"{n} comparison\(s\) are too few .* training loss"):
+        result = fit(few, key=KEY, validation_fraction=fraction)
+    asked = fit(few, key=KEY, selection="training_loss")
+    assert result.selection == "training_loss"
+    assert result.chosen == asked.chosen
+    np.testing.assert_array_equal(result.models.theta, asked.models.theta)
+
+
+def test_a_whole_number_is_a_key():
+    one, same, other = (fit(FEW, key=key, restarts=2).models.theta for key in (3, np.int64(3), 4))
+    np.testing.assert_array_equal(one, same)
+    assert (one != other).any()
+    scale = np.ones(3)
+    for model in (QuadraticCost.random(2, 1, key=3), ICNNCost.random(scale, key=3)):
+        assert np.isfinite(jax.tree.leaves(model)[0]).all()
+
+
 LARGE = Comparisons(jax.tree.map(lambda leaf: 1e200 * leaf, POOL), [0], [1], [1])
 LOSS = {"selection": "training_loss"}
 
@@ -261,8 +281,7 @@ LOSS = {"selection": "training_loss"}
         (lambda: fit(FEW, key=KEY, validation_fraction=0), r"must lie in \(0, 1\), got 0"),
         (lambda: fit(FEW, key=KEY, validation_fraction=1.0), r"must lie in \(0, 1\), got 1"),
         (lambda: fit(FEW, key=KEY, validation_fraction=np.nan), r"must lie in \(0, 1\), got nan"),
-        (lambda: fit(FEW.subset([0]), key=KEY), "enough pairs to split for validation, got 1"),
-        (lambda: fit(FEW, key=0), "key must be a single JAX random key.*got int"),
+        (lambda: fit(FEW, key=-1), "key must be a single JAX random key.*got -1"),
         (lambda: fit(FEW, key=jax.random.split(KEY)), r"key must be a single.*\(2,\)"),
         (lambda: fit(FEW, key=KEY, restarts=0), "restarts must be a whole number of at least 1"),
         (lambda: fit(FEW, key=KEY, l2=-1), "l2 must be finite and at least 0, got -1"),

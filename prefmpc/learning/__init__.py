@@ -1,9 +1,9 @@
 """Learning σ from comparisons: the paper's recipe, the most probable weights, their posterior."""
 
+from prefmpc._results import FitError
 from prefmpc.learning.convex import Interval, MapResult, fit_map, fit_maps
 from prefmpc.learning.early_stopping import NetworkFit, fit_network
 from prefmpc.learning.global_fit import GlobalResult, fit_global
-from prefmpc.learning.losses import FitError
 from prefmpc.learning.priors import WishartPrior, blocks, bryson
 from prefmpc.learning.selection import PriorChoice, choose_prior
 from prefmpc.learning.training import FitResult, fit

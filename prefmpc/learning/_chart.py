@@ -11,7 +11,8 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 
 from prefmpc._checks import to_numpy
-from prefmpc.learning._newton import Problem, loss, loss_and_slopes, second_order
+from prefmpc.learning._newton import backtrack
+from prefmpc.learning._problem import Problem, data_derivatives, loss
 
 
 class Chart(NamedTuple):
@@ -108,15 +109,14 @@ def laplace(chart: Chart, w: Any, gap: Any, labels: Any, weights: Any, strength:
     def value(eta: Any) -> Any:
         return minus_log_posterior(chart, eta, gap, labels, weights, strength)
 
-    def slopes(eta: Any) -> tuple[Any, Any]:
-        _, slope, curvature = loss_and_slopes(chart.weights(eta) @ gap, labels, weights)
-        both = second_order(gap, slope, curvature)
+    def derivatives(eta: Any) -> tuple[Any, Any]:
+        slope, curvature = data_derivatives(gap, chart.weights(eta) @ gap, labels, weights)
 
         def rest(eta: Any) -> Any:  # what is left after the data's own curvature; p × p only
-            return chart.weights(eta) @ both[-1] + chart.minus_log_prior(eta, strength)
+            return chart.weights(eta) @ slope + chart.minus_log_prior(eta, strength)
 
         J = jax.jacfwd(chart.weights)(eta)
-        return jax.grad(rest)(eta), J.T @ both[:-1] @ J + jax.hessian(rest)(eta)
+        return jax.grad(rest)(eta), J.T @ curvature @ J + jax.hessian(rest)(eta)
 
     def unfinished(carry: Any) -> Any:
         _, _, _, decrement, k = carry
@@ -124,28 +124,20 @@ def laplace(chart: Chart, w: Any, gap: Any, labels: Any, weights: Any, strength:
 
     def move(carry: Any) -> Any:
         eta, now, _, _, k = carry
-        gradient, hessian = slopes(eta)
+        gradient, hessian = derivatives(eta)
         values, vectors = jnp.linalg.eigh(hessian)
         # Not convex in η: away from the mode, turn directions of negative curvature round.
         values = jnp.maximum(jnp.abs(values), 1e-6 * jnp.max(jnp.abs(values)))
         turned = vectors.T @ gradient
         step = -vectors @ (turned / values)
         decrement = 0.5 * turned @ (turned / values)
-
-        def refused(search: Any) -> Any:
-            t, trial = search
-            return ~(trial <= now - 0.2 * t * decrement + 1e-12 * (1 + jnp.abs(now))) & (t > 1e-9)
-
-        def shorter(search: Any) -> Any:
-            t = search[0] / 2
-            return t, value(eta + t * step)
-
-        t: Any
-        t, trial = jax.lax.while_loop(refused, shorter, (2.0, jnp.nan))
-        root = vectors * jnp.sqrt(values)
+        slack = 1e-12 * (1 + jnp.abs(now))
+        t, trial = backtrack(
+            lambda t: value(eta + t * step), now, 0.2 * decrement, slack, shrink=0.5, least=1e-9
+        )
         done = decrement <= 1e-9
-        eta = jnp.where(done, eta, eta + t * step)
-        return eta, jnp.where(done, now, trial), root, decrement, k + 1
+        eta, now = jnp.where(done, eta, eta + t * step), jnp.where(done, now, trial)
+        return eta, now, vectors * jnp.sqrt(values), decrement, k + 1
 
     eta = chart.coordinates(w)
     p = eta.size

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-import warnings
 from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -17,10 +16,9 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 from jax.typing import ArrayLike
-from scipy.special import ndtri
+from scipy.special import expit, ndtri
 
 from prefmpc._checks import (
-    finite_array,
     instance,
     instances,
     nonnegative,
@@ -28,18 +26,12 @@ from prefmpc._checks import (
     require_x64,
     share,
 )
+from prefmpc._results import Result, warn_of_failure
 from prefmpc._sharding import check_mesh
-from prefmpc.learning._newton import (
-    Entries,
-    Minimum,
-    Problem,
-    build,
-    pair_gaps,
-    solve,
-    solve_shared,
-)
-from prefmpc.learning.losses import FitError, padded_size
-from prefmpc.learning.priors import Structure, WishartPrior, free_entries
+from prefmpc.learning._newton import Minimum, solve
+from prefmpc.learning._problem import Problem, build, check
+from prefmpc.learning.losses import padded_size
+from prefmpc.learning.priors import Structure, WishartPrior
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.preferences.comparisons import Comparisons
 from prefmpc.preferences.trajectories import Trajectory
@@ -56,7 +48,7 @@ class Interval(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class MapResult:
+class MapResult(Result):
     """The most probable (Q, R) after the answers.
 
     Attributes
@@ -79,6 +71,8 @@ class MapResult:
         What was asked.
     """
 
+    NAME = "fit_map"
+
     Q: np.ndarray
     R: np.ndarray
     status: Status
@@ -95,19 +89,9 @@ class MapResult:
     minimum: Minimum = dataclasses.field(repr=False)
 
     @property
-    def success(self) -> bool:
-        """Whether the decrement certifies the minimum."""
-        return self.status == "converged"
-
-    @property
     def message(self) -> str:
         """One sentence on how it went."""
         return f"{self.status} after {self.iterations} Newton steps, decrement {self.decrement:.1e}"
-
-    def check(self) -> None:
-        """Raise a `FitError` unless the minimum was reached."""
-        if not self.success:
-            raise FitError(f"fit_map: {self.message}")
 
     @property
     def model(self) -> QuadraticCost:
@@ -148,11 +132,24 @@ class MapResult:
 
     def _std(self) -> tuple[np.ndarray, np.ndarray]:
         self.check()
-        basis = self.problem.in_user_units(np.eye(self.minimum.w.size))  # (p, d, d): ∂W/∂w
         covariance = np.linalg.inv(self.minimum.hessian)
-        parts = split(basis, len(self.prior.Q), self.outputs)
-        Q, R = (np.sqrt(np.einsum("aij,ab,bij->ij", P, covariance, P)) for P in parts)
+        slopes = self.problem.costs(np.eye(self.minimum.w.size))  # ∂Q/∂w (p, nx, nx), ∂R/∂w
+        Q, R = (np.sqrt(np.einsum("aij,ab,bij->ij", S, covariance, S)) for S in slopes)
         return Q, R
+
+    def gaps(self, first: Any, second: Any) -> np.ndarray:
+        """Return the derivatives (p, ...) of σ(second) − σ(first) with respect to the weights."""
+        instance("first", first, Trajectory)
+        instance("second", second, Trajectory)
+        shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(side)] for side in (first, second)]
+        trained = self.comparisons.trajectories
+        channels = [side.shape[-1] for side in (trained.x, trained.u)]
+        if shapes[0] != shapes[1] or [first.x.shape[-1], first.u.shape[-1]] != channels:
+            raise ValueError(
+                f"first and second must have equal shapes with {channels[0]} states and "
+                f"{channels[1]} inputs, got {shapes[0]} and {shapes[1]}"
+            )
+        return self.problem.moments(second) - self.problem.moments(first)
 
     def probability(self, first: Trajectory, second: Trajectory, level: float = 0.9) -> Interval:
         """Return P(first is preferred), and how sure we are of it, by Laplace's method.
@@ -174,12 +171,13 @@ class MapResult:
             approximation.
         """
         self.check()
-        gap, batch, tail = new_gaps(self, first, second, level)
-        z = self.minimum.w @ gap
-        variance = np.einsum("an,an->n", gap, np.linalg.solve(self.minimum.hessian, gap))
-        reach = -ndtri(tail) * np.sqrt(variance)
-        odds = (z / np.sqrt(1 + np.pi * variance / 8), z - reach, z + reach)
-        return Interval(*((0.5 * (1 + np.tanh(0.5 * part))).reshape(batch) for part in odds))
+        reach = ndtri((1 + share("level", level)) / 2)
+        gap = self.gaps(first, second)
+        z = np.tensordot(self.minimum.w, gap, 1)
+        variance = (gap * np.tensordot(np.linalg.inv(self.minimum.hessian), gap, 1)).sum(axis=0)
+        std = np.sqrt(variance)
+        odds = (z / np.sqrt(1 + np.pi * variance / 8), z - reach * std, z + reach * std)
+        return Interval(*(expit(part) for part in odds))
 
     def nearest_diagonal(self) -> MapResult:
         """Return the best diagonal (Q, R) for the same answers: a few numbers that can be read.
@@ -237,9 +235,9 @@ def fit_map(
     instance("comparisons", comparisons, Comparisons)
     instance("prior", prior, WishartPrior)
     mesh = None if mesh is None else check_mesh(mesh)
-    results = _solved([comparisons], [prior], structure, outputs, max_iterations, tol, mesh)
-    _warn_of_failures(results)
-    return results[0]
+    result = _solved([comparisons], [prior], structure, outputs, max_iterations, tol, mesh)[0]
+    warn_of_failure(result)
+    return result
 
 
 def fit_maps(
@@ -265,130 +263,10 @@ def fit_maps(
     """
     data_sets, beliefs = _paired(comparisons, priors)
     results = _solved(data_sets, beliefs, structure, outputs, max_iterations, tol)
-    _warn_of_failures(results)
-    return results
-
-
-def _solved(
-    data_sets: list[Comparisons],
-    beliefs: list[WishartPrior],
-    structure: Structure,
-    outputs: ArrayLike | None,
-    max_iterations: int,
-    tol: float,
-    mesh: Mesh | None = None,
-) -> list[MapResult]:
-    require_x64()
-    began = time.perf_counter()
-    limit, tol = positive_int("max_iterations", max_iterations), nonnegative("tol", tol)
-    C, entries = check(data_sets, beliefs, structure, outputs)
-    parts = 1 if mesh is None else mesh.size
-    size = parts * padded_size(max(-(-len(data) // parts) for data in data_sets))
-    if all(data is data_sets[0] for data in data_sets):
-        problems = build(data_sets[0], beliefs, entries, C, size)
-    else:
-        pairs = zip(data_sets, beliefs, strict=True)
-        problems = [build(data, [prior], entries, C, size)[0] for data, prior in pairs]
-    if mesh is None:
-        minima = solve(problems, tol, limit)
-    else:
-        minima = [solve_shared(problem, tol, limit, mesh) for problem in problems]
-    results = []
-    for problem, minimum, data, prior in zip(problems, minima, data_sets, beliefs, strict=True):
-        Q, R = split(problem.in_user_units(minimum.w), len(prior.Q), C)
-        results.append(
-            MapResult(
-                Q=Q,
-                R=R,
-                status=_status(minimum, Q, R, tol),
-                # log det in the user's units
-                objective=float(minimum.objective) + prior.strength * problem.log_unit,
-                log_likelihood=float(minimum.log_likelihood),
-                decrement=float(minimum.decrement),
-                iterations=int(minimum.steps),
-                seconds=time.perf_counter() - began,
-                comparisons=data,
-                prior=prior,
-                structure=structure,
-                outputs=C,
-                problem=problem,
-                minimum=minimum,
-            )
-        )
-    return results
-
-
-def _warn_of_failures(results: list[MapResult]) -> None:
-    """Warn the caller of the public function that called this one."""
     if bad := [result for result in results if not result.success]:
         many = f" ({len(bad)} of {len(results)} problems)" if len(results) > 1 else ""
-        warnings.warn(f"fit_map: {bad[0].message}{many}", RuntimeWarning, stacklevel=3)
-
-
-def new_gaps(
-    result: MapResult, first: Any, second: Any, level: float
-) -> tuple[np.ndarray, tuple[int, ...], float]:
-    """Return the moment differences (p, n) of new pairs, their batch shape and (1 − level) / 2."""
-    level = share("level", level)
-    instance("first", first, Trajectory)
-    instance("second", second, Trajectory)
-    shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(side)] for side in (first, second)]
-    trained = result.comparisons.trajectories
-    channels = [side.shape[-1] for side in (trained.x, trained.u)]
-    if shapes[0] != shapes[1] or [first.x.shape[-1], first.u.shape[-1]] != channels:
-        raise ValueError(
-            f"first and second must have equal shapes with {channels[0]} states and "
-            f"{channels[1]} inputs, got {shapes[0]} and {shapes[1]}"
-        )
-    batch = first.batch_shape
-    flat = [
-        jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[len(batch) :]), side)
-        for side in (first, second)
-    ]
-    n = len(flat[0])
-    one, other = flat
-    pairs = Comparisons.from_arrays(one.x, one.u, other.x, other.u, np.full(n, 0.5))
-    problem = result.problem
-    gap = pair_gaps(pairs, problem.entries, problem.unit, result.outputs)
-    return gap, batch, (1 - level) / 2
-
-
-def split(W: np.ndarray, nq: int, outputs: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Return Q (..., nx, nx) and R (..., nu, nu) of matrices W (..., d, d) = blkdiag(Q, R)."""
-    Q, R = W[..., :nq, :nq], W[..., nq:, nq:]
-    return (Q if outputs is None else outputs.T @ Q @ outputs), R
-
-
-def check(
-    data_sets: Sequence[Comparisons],
-    priors: Sequence[WishartPrior],
-    structure: Structure,
-    outputs: ArrayLike | None,
-) -> tuple[np.ndarray | None, Entries]:
-    """Return C and the free entries; raise a ValueError unless everything fits together."""
-    first = data_sets[0].trajectories
-    nx, nu = first.x.shape[-1], first.u.shape[-1]
-    C = None
-    if outputs is not None:
-        C = np.asarray(finite_array("outputs", outputs, ndim=2))
-        if C.shape[1] != nx:
-            raise ValueError(f"outputs must have {nx} columns, one a state, got shape {C.shape}")
-    nq, what = (nx, "states") if C is None else (C.shape[0], "outputs")
-    for data in data_sets[1:]:
-        sizes = data.trajectories.x.shape[-1], data.trajectories.u.shape[-1]
-        if sizes != (nx, nu):
-            raise ValueError(
-                f"comparisons must all have {nx} states and {nu} inputs, "
-                f"got {sizes[0]} and {sizes[1]}"
-            )
-    for prior in priors:
-        if prior.Q.shape != (nq, nq) or prior.R.shape != (nu, nu):
-            raise ValueError(
-                f"prior must weigh {nq} {what} and {nu} inputs, "
-                f"got Q {prior.Q.shape} and R {prior.R.shape}"
-            )
-        rows, columns = free_entries(structure, prior)
-    return C, Entries.of(rows, columns)
+        warn_of_failure(bad[0], many)
+    return results
 
 
 def _paired(
@@ -412,7 +290,49 @@ def _paired(
     return data_sets, beliefs
 
 
-def _status(minimum: Minimum, Q: np.ndarray, R: np.ndarray, tol: float) -> Status:
-    if not (np.isfinite(Q).all() and np.isfinite(R).all() and np.isfinite(minimum.objective)):
-        return "not_finite"
-    return "converged" if minimum.converged(tol) else "max_iterations"
+def _solved(
+    data_sets: list[Comparisons],
+    priors: list[WishartPrior],
+    structure: Structure,
+    outputs: ArrayLike | None,
+    max_iterations: int,
+    tol: float,
+    mesh: Mesh | None = None,
+) -> list[MapResult]:
+    require_x64()
+    began = time.perf_counter()
+    limit, tol = positive_int("max_iterations", max_iterations), nonnegative("tol", tol)
+    C, entries = check(data_sets, priors, structure, outputs)
+    parts = 1 if mesh is None else mesh.size
+    size = parts * padded_size(max(-(-len(data) // parts) for data in data_sets))
+    if all(data is data_sets[0] for data in data_sets):
+        problems = build(data_sets[0], priors, entries, C, size)
+    else:
+        pairs = zip(data_sets, priors, strict=True)
+        problems = [build(data, [prior], entries, C, size)[0] for data, prior in pairs]
+    results = []
+    minima = solve(problems, tol, limit, mesh)
+    for problem, minimum, data, prior in zip(problems, minima, data_sets, priors, strict=True):
+        Q, R = problem.costs(minimum.w)
+        finite = all(np.isfinite(part).all() for part in (Q, R, minimum.objective))
+        reached: Status = "converged" if minimum.converged(tol) else "max_iterations"
+        results.append(
+            MapResult(
+                Q=Q,
+                R=R,
+                status=reached if finite else "not_finite",
+                # log det in the user's units
+                objective=float(minimum.objective) + prior.strength * problem.log_unit,
+                log_likelihood=float(minimum.log_likelihood),
+                decrement=float(minimum.decrement),
+                iterations=int(minimum.steps),
+                seconds=time.perf_counter() - began,
+                comparisons=data,
+                prior=prior,
+                structure=structure,
+                outputs=C,
+                problem=problem,
+                minimum=minimum,
+            )
+        )
+    return results

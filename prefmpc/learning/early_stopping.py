@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import time
-import warnings
 from typing import Any
 
 import jax
@@ -13,15 +12,21 @@ import numpy as np
 
 from prefmpc._checks import flag, instance, nonnegative, positive_int, require_x64, share, to_numpy
 from prefmpc._random import generator
+from prefmpc._results import FitError, Restarts, warn_of_failure
+from prefmpc.learning._starts import (
+    adam_step,
+    begin_adam,
+    check_starts,
+    finite_models,
+    held_out_count,
+)
 from prefmpc.learning.losses import (
-    FitError,
     PairData,
     cross_entropy,
     objective,
     padded_size,
     pair_data,
 )
-from prefmpc.learning.training import adam, adam_step, check_starts, held_out_count
 from prefmpc.models.quadratic import CostModel
 from prefmpc.preferences.comparisons import Comparisons
 
@@ -29,7 +34,7 @@ CHECK_EVERY = 10
 
 
 @dataclasses.dataclass(frozen=True)
-class NetworkFit:
+class NetworkFit(Restarts):
     """Restarts of `fit_network`, each at its best moment, and which one was chosen.
 
     Attributes
@@ -51,6 +56,8 @@ class NetworkFit:
     seconds : float
     """
 
+    NAME = "fit_network"
+
     models: Any
     chosen: int | None
     validation_loss: np.ndarray
@@ -59,11 +66,6 @@ class NetworkFit:
     best: np.ndarray
     status: np.ndarray
     seconds: float
-
-    @property
-    def success(self) -> bool:
-        """Whether at least one restart stayed finite."""
-        return self.chosen is not None
 
     @property
     def message(self) -> str:
@@ -78,12 +80,8 @@ class NetworkFit:
             f"validation loss {loss:.4g}"
         )
 
-    @property
-    def model(self) -> Any:
-        """The chosen model. Raises a `FitError` if there is none."""
-        if self.chosen is None:
-            raise FitError(f"{self.message}. The models as they were are in .models")
-        return jax.tree.map(lambda leaf: leaf[self.chosen], self.models)
+    def _error(self) -> FitError:
+        return FitError(f"{self.message}. The models as they were are in .models")
 
 
 def fit_network(
@@ -111,7 +109,7 @@ def fit_network(
     comparisons : Comparisons
     initial : model
         The starts, stacked along a leading axis, for instance ``MLPCost.random(..., shape=(8,))``.
-    key : JAX random key
+    key : JAX random key or int
         Draws the split and the mini-batches.
     validation : Comparisons, optional
         Held-out answers of your own, for instance about other trajectories. Default: a random
@@ -148,46 +146,69 @@ def fit_network(
     data = pair_data(starts, training, padded_size(len(training)))
     test = pair_data(starts, held_out, padded_size(len(held_out), 128))
 
-    state = _begin(starts)
-    best = to_numpy(state[0])
-    restarts = len(jax.tree.leaves(best)[0])
-    lowest, since = np.full(restarts, np.inf), np.zeros(restarts, dtype=int)
-    running, best_at = np.ones(restarts, dtype=bool), np.zeros(restarts, dtype=int)
-    finite = np.ones(restarts, dtype=bool)
-    histories: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
-    for i in _bar(rounds, progress):
+    record = _Record.of(_begin(starts))
+    for _ in _bar(rounds, progress):
         batches = _batches(len(training), data.labels.size, batch_size, rng)
-        state, losses = _advance(state, data, test, settings, batches)
-        trained, held = (np.array(part) for part in losses)
-        trained[~running], held[~running] = np.nan, np.nan
-        histories[0].append(trained)
-        histories[1].append(held)
-        models = to_numpy(state[0])
-        # A weight that is NaN need not show in the losses: a ReLU may pass over it.
-        finite &= ~running | (np.isfinite(held) & np.isfinite(trained) & _finite(models))
-        better = running & finite & (held < lowest)
-        best = jax.tree.map(lambda old, new, b=better: _where(b, new, old), best, models)
-        lowest, best_at = np.where(better, held, lowest), np.where(better, i, best_at)
-        since = np.where(better, 0, since + 1)
-        running &= finite & (since < patience)
-        if not running.any():
+        state, losses = _advance(record.state, data, test, settings, batches)
+        record.add(state, losses, patience)
+        if not record.running.any():
             break
-    status = np.where(running, "max_epochs", "stopped").astype("<U10")
-    usable = finite & np.isfinite(lowest)
-    status[~usable] = "not_finite"
-    result = NetworkFit(
-        models=best,
-        chosen=int(np.argmin(np.where(usable, lowest, np.inf))) if usable.any() else None,
-        validation_loss=np.stack(histories[1]),
-        training_loss=np.stack(histories[0]),
-        epochs=CHECK_EVERY * np.arange(1, len(histories[0]) + 1),
-        best=best_at,
-        status=status,
-        seconds=time.perf_counter() - began,
-    )
-    if not result.success:
-        warnings.warn(f"fit_network: {result.message}", RuntimeWarning, stacklevel=2)
+    result = record.result(time.perf_counter() - began)
+    warn_of_failure(result)
     return result
+
+
+@dataclasses.dataclass
+class _Record:
+    """Where training stands, and the best moment of each restart (m,)."""
+
+    state: Any
+    best: Any
+    lowest: np.ndarray
+    best_at: np.ndarray
+    running: np.ndarray
+    finite: np.ndarray
+    losses: list[np.ndarray] = dataclasses.field(default_factory=list)
+    """Of each check (2, m): of trained and of held-out answers, NaN after the end."""
+
+    @classmethod
+    def of(cls, state: Any) -> _Record:
+        """Begin with the starts."""
+        models = to_numpy(state[0])
+        m = len(jax.tree.leaves(models)[0])
+        yes = np.ones(m, dtype=bool)
+        return cls(state, models, np.full(m, np.inf), np.zeros(m, dtype=int), yes, yes)
+
+    def add(self, state: Any, losses: Any, patience: int) -> None:
+        """Take down a check, and end the restarts that are not finite or no longer get better."""
+        self.state, models, check = state, to_numpy(state[0]), len(self.losses)
+        self.losses.append(np.where(self.running, to_numpy(losses), np.nan))
+        trained, held = self.losses[-1]
+        # A weight that is NaN need not show in the losses: a ReLU may pass over it.
+        fine = np.isfinite(held) & np.isfinite(trained) & finite_models(models)
+        self.finite = self.finite & (fine | ~self.running)
+        better = self.running & self.finite & (held < self.lowest)
+        self.best = jax.tree.map(lambda new, old: _where(better, new, old), models, self.best)
+        self.lowest = np.where(better, held, self.lowest)
+        self.best_at = np.where(better, check, self.best_at)
+        self.running = self.running & self.finite & (check - self.best_at < patience)
+
+    def result(self, seconds: float) -> NetworkFit:
+        """Return what came of it."""
+        usable = self.finite & np.isfinite(self.lowest)
+        status = np.where(self.running, "max_epochs", "stopped").astype("<U10")
+        status[~usable] = "not_finite"
+        trained, held = np.stack(self.losses, axis=1)
+        return NetworkFit(
+            models=self.best,
+            chosen=int(np.argmin(np.where(usable, self.lowest, np.inf))) if usable.any() else None,
+            validation_loss=held,
+            training_loss=trained,
+            epochs=CHECK_EVERY * np.arange(1, len(held) + 1),
+            best=self.best_at,
+            status=status,
+            seconds=seconds,
+        )
 
 
 def _split(
@@ -197,6 +218,10 @@ def _split(
         instance("validation", validation, Comparisons)
         return comparisons, validation
     held = held_out_count(len(comparisons), fraction)
+    if not held:
+        raise ValueError(
+            f"comparisons must hold enough pairs to split for validation, got {len(comparisons)}"
+        )
     order = rng.permutation(len(comparisons))
     return comparisons.subset(order[held:]), comparisons.subset(order[:held])
 
@@ -211,12 +236,6 @@ def _bar(rounds: int, progress: bool) -> Any:
 
 def _where(mask: np.ndarray, new: Any, old: Any) -> Any:
     return np.where(mask.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-
-
-def _finite(models: Any) -> np.ndarray:
-    """Say which models of a stack have finite weights only."""
-    leaves = jax.tree.leaves(models)
-    return np.all([np.isfinite(leaf).reshape(len(leaf), -1).all(axis=1) for leaf in leaves], axis=0)
 
 
 def _batches(n: int, padded: int, size: int, rng: np.random.Generator) -> Any:
@@ -238,9 +257,7 @@ def _batches(n: int, padded: int, size: int, rng: np.random.Generator) -> Any:
 
 @jax.jit
 def _begin(starts: Any) -> tuple[Any, Any]:
-    lower, upper = starts.bounds()
-    inside = jax.tree.map(jnp.clip, starts, lower, upper)
-    return inside, jax.vmap(adam(0.0).init)(inside)
+    return jax.vmap(lambda start: begin_adam(start, start.bounds()))(starts)
 
 
 @jax.jit

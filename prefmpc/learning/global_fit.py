@@ -13,8 +13,10 @@ import numpy as np
 import scipy.special
 
 from prefmpc._checks import choice, instance, positive, require_x64, to_numpy
-from prefmpc.learning._newton import Entries, loss, loss_and_slopes, second_order
-from prefmpc.learning.losses import FitError, PairData, padded_size, pair_data
+from prefmpc._results import Result, warn_of_failure
+from prefmpc.learning._newton import backtrack
+from prefmpc.learning._problem import Entries, data_derivatives, loss
+from prefmpc.learning.losses import PairData, padded_size, pair_data
 from prefmpc.models.quadratic import DIAGONAL_MIN, QuadraticCost, _semidefinite_factor
 from prefmpc.preferences.comparisons import Comparisons
 
@@ -32,7 +34,7 @@ TOLERANCES = {
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class GlobalResult:
+class GlobalResult(Result):
     """The global minimum of eq. (6) over (Q, R).
 
     Attributes
@@ -51,6 +53,8 @@ class GlobalResult:
         Wall time, compilation included if there was one.
     """
 
+    NAME = "fit_global"
+
     Q: np.ndarray
     R: np.ndarray
     objective: float
@@ -60,11 +64,6 @@ class GlobalResult:
     seconds: float
 
     @property
-    def success(self) -> bool:
-        """Whether the solver certifies the minimum."""
-        return self.status == "converged"
-
-    @property
     def message(self) -> str:
         """One sentence on how it went."""
         return f"{self.status} after {self.iterations} steps, gap {self.gap:.1e}"
@@ -72,8 +71,7 @@ class GlobalResult:
     @property
     def model(self) -> QuadraticCost:
         """The learned σ. Raises a `FitError` unless the minimum was reached."""
-        if not self.success:
-            raise FitError(f"fit_global: {self.message}")
+        self.check()
         return QuadraticCost(self.Q, self.R)
 
 
@@ -135,8 +133,7 @@ def fit_global(
         iterations=steps,
         seconds=time.perf_counter() - began,
     )
-    if not result.success:
-        warnings.warn(f"fit_global: {result.message}", RuntimeWarning, stacklevel=2)
+    warn_of_failure(result)
     return result
 
 
@@ -182,10 +179,9 @@ def _follow(
         return -jnp.sum(jnp.log(slack))  # NaN outside
 
     def direction(w: Any, mu: Any) -> tuple[Any, Any]:
-        _, slope, curvature = loss_and_slopes(w @ gap, labels, weights)
-        both = second_order(gap, slope, curvature)
-        gradient = both[-1] + l2 * on_diagonal + mu * jax.grad(barrier)(w)
-        hessian = both[:-1] + mu * jax.hessian(barrier)(w)
+        slope, curvature = data_derivatives(gap, w @ gap, labels, weights)
+        gradient = slope + l2 * on_diagonal + mu * jax.grad(barrier)(w)
+        hessian = curvature + mu * jax.hessian(barrier)(w)
         unit = 1 / jnp.sqrt(jnp.diag(hessian))
         step = -unit * jnp.linalg.solve(hessian * unit * unit[:, None], unit * gradient)
         return step, -gradient @ step
@@ -193,18 +189,13 @@ def _follow(
     def move(carry: Any) -> Any:
         w, mu, _, k, _ = carry
         step, squared = direction(w, mu)
-        now = objective(w) + mu * barrier(w)
 
-        def refused(search: Any) -> Any:
-            t, trial = search
-            return ~(trial <= now - 0.1 * t * squared + 1e-14 * jnp.abs(now)) & (t > 1e-10)
+        def value(t: Any) -> Any:
+            return objective(w + t * step) + mu * barrier(w + t * step)
 
-        def shorter(search: Any) -> Any:
-            t = search[0] / 2
-            return t, objective(w + t * step) + mu * barrier(w + t * step)
-
-        t: Any
-        t, trial = jax.lax.while_loop(refused, shorter, (2.0, jnp.nan))
+        now = value(0.0)
+        slack = 1e-14 * jnp.abs(now)
+        t, trial = backtrack(value, now, 0.1 * squared, slack, shrink=0.5, least=1e-10)
         w = jnp.where(trial <= now, w + t * step, w)
         # In the centre the gap is m·mu; the decrement, in units of mu, says how near it is.
         central = (squared <= 0.1 * mu) | ~(t > 1e-10)

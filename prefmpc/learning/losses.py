@@ -19,10 +19,6 @@ SMALLEST_POOL = 128
 """The same for the number of trajectories, where σ is computed once for each of them."""
 
 
-class FitError(RuntimeError):
-    """No model was learned that may be used."""
-
-
 def padded_size(n: int, smallest: int = SMALLEST_SHAPE) -> int:
     """Return the shape that ``n`` pairs are padded to, so that few shapes need compiling."""
     return max(smallest, 1 << (n - 1).bit_length())

@@ -10,10 +10,12 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from prefmpc._checks import choice, instance, instances, positive_int, require_x64
+from prefmpc._results import FitError
 from prefmpc.learning._chart import Chart, laplaces
-from prefmpc.learning._newton import build, solve
-from prefmpc.learning.convex import MapResult, check, fit_map
-from prefmpc.learning.losses import FitError, padded_size
+from prefmpc.learning._newton import solve
+from prefmpc.learning._problem import build, check
+from prefmpc.learning.convex import MapResult, fit_map
+from prefmpc.learning.losses import padded_size
 from prefmpc.learning.priors import Structure, WishartPrior
 from prefmpc.preferences.comparisons import Comparisons
 

@@ -6,12 +6,11 @@ import dataclasses
 import time
 import warnings
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 
 from prefmpc._checks import (
     choice,
@@ -24,9 +23,10 @@ from prefmpc._checks import (
     traced,
 )
 from prefmpc._random import generator
+from prefmpc._results import FitError, Restarts, warn_of_failure
 from prefmpc.learning._lbfgsb import minimise
+from prefmpc.learning._starts import check_starts, finite_models, held_out_count, projected_adam
 from prefmpc.learning.losses import (
-    FitError,
     PairData,
     cross_entropy,
     logits,
@@ -34,7 +34,7 @@ from prefmpc.learning.losses import (
     padded_size,
     pair_data,
 )
-from prefmpc.models.quadratic import CostModel, QuadraticCost, check_model
+from prefmpc.models.quadratic import CostModel, QuadraticCost
 from prefmpc.preferences.comparisons import Comparisons
 
 Selection = Literal["validation", "training_loss", "leaky_test_accuracy"]
@@ -45,7 +45,7 @@ BOUND_ROUNDING = 1e-9
 
 
 @dataclasses.dataclass(frozen=True)
-class FitResult:
+class FitResult(Restarts):
     """What came of every restart, and which one was chosen.
 
     Attributes
@@ -71,6 +71,8 @@ class FitResult:
         Wall time, compilation included if there was one.
     """
 
+    NAME = "fit"
+
     models: Any
     chosen: int | None
     selection: Selection
@@ -84,11 +86,6 @@ class FitResult:
     seconds: float
 
     @property
-    def success(self) -> bool:
-        """Whether at least one restart converged to finite weights within the bounds."""
-        return self.chosen is not None
-
-    @property
     def message(self) -> str:
         """One sentence on how it went."""
         counts = {name: int((self.status == name).sum()) for name in get_args(Status)}
@@ -96,14 +93,10 @@ class FitResult:
         how = f"restart {self.chosen} chosen by {self.selection}" if self.success else "none usable"
         return f"{self.status.size} restarts: {seen}; {how}"
 
-    @property
-    def model(self) -> Any:
-        """The chosen model. Raises a `FitError` if no restart may be used."""
-        if self.chosen is None:
-            raise FitError(
-                f"{self.message}. The models as they stopped are in .models, the reasons in .status"
-            )
-        return jax.tree.map(lambda leaf: leaf[self.chosen], self.models)
+    def _error(self) -> FitError:
+        return FitError(
+            f"{self.message}. The models as they stopped are in .models, the reasons in .status"
+        )
 
 
 def fit(
@@ -133,13 +126,14 @@ def fit(
     comparisons : Comparisons
     initial : model, optional
         The starts, stacked along a leading axis. Default: ``restarts`` random `QuadraticCost`.
-    key : JAX random key
+    key : JAX random key or int
         Draws the starts and the validation split.
     selection : {"validation", "training_loss", "leaky_test_accuracy"}
         How the restart is chosen. "validation" (default) keeps ``validation_fraction`` of the
-        pairs out of training and takes the smallest cross-entropy on them. "training_loss" trains
-        on all pairs. "leaky_test_accuracy" trains on all pairs and takes the best accuracy on
-        ``test``, as the paper does: whatever is then measured on ``test`` is too good.
+        pairs out of training and takes the smallest cross-entropy on them, or, where they are too
+        few for that, warns and does as "training_loss", which trains on all pairs.
+        "leaky_test_accuracy" trains on all pairs and takes the best accuracy on ``test``, as the
+        paper does: whatever is then measured on ``test`` is too good.
     tol : float
         L-BFGS-B stops when no entry of the projected gradient is larger.
 
@@ -154,58 +148,90 @@ def fit(
     """
     require_x64()
     began = time.perf_counter()
-    held = _check_options(comparisons, selection, validation_fraction, test)
+    instance("comparisons", comparisons, Comparisons)
+    n = len(comparisons)
+    selection, held = _selection(n, selection, validation_fraction, test)
     l2, l1, tol = nonnegative("l2", l2), nonnegative("l1", l1), nonnegative("tol", tol)
     learning_rate = nonnegative("learning_rate", learning_rate)
-    rng = generator(key)
-    starts = _starts(comparisons, initial, restarts, rng)
-
-    n = len(comparisons)
-    data = pair_data(starts, comparisons, padded_size(n))
-    held_out = np.zeros(0, dtype=int)
-    if selection == "validation":
-        held_out = rng.permutation(n)[:held]
-        weights = data.weights.copy()
-        weights[held_out] = 0.0
-        data = data._replace(weights=weights)
-
+    rng, restarts = generator(key), positive_int("restarts", restarts)
+    if initial is None:
+        nx, nu = comparisons.trajectories.x.shape[-1], comparisons.trajectories.u.shape[-1]
+        starts: Any = QuadraticCost.random(nx, nu, key=rng, shape=(restarts,))
+    else:
+        starts = check_starts(comparisons, initial)
     settings = (l2, l1, learning_rate, positive_int("max_iterations", max_iterations), tol)
+    adam_steps = positive_int("adam_steps", adam_steps)
+
+    data = pair_data(starts, comparisons, padded_size(n))
+    held_out = rng.permutation(n)[:held] if held else np.zeros(0, dtype=int)
+    data.weights[held_out] = 0.0
     split_signs = l1 > 0  # |θ| is smooth only where θ is split into its two signs
     with traced("initial"):
-        out = _train(starts, data, settings, positive_int("adam_steps", adam_steps), split_signs)
-    models, loss, accuracy, iterations, error, violation = to_numpy(out)
-
-    finite = np.isfinite(loss)
-    for leaf in jax.tree.leaves(models):
-        finite &= np.isfinite(leaf).reshape(leaf.shape[0], -1).all(axis=1)
-    status = np.full(loss.shape, "converged", dtype="<U14")
-    status[~(error <= tol)] = "max_iterations"
-    status[~(violation <= BOUND_ROUNDING)] = "out_of_bounds"
-    status[~finite] = "not_finite"
-
-    if selection == "validation":
-        score = _scores(models, comparisons.subset(held_out), "loss")
-    elif selection == "training_loss":
+        out = _train(starts, data, settings, adam_steps, split_signs)
+    trained = _Trained(*to_numpy(out))
+    status, loss = _status(trained, tol), trained.training_loss
+    if selection == "training_loss":
         score = loss
     else:
-        assert test is not None
-        score = _scores(models, test, "errors")
+        judges = comparisons.subset(held_out) if test is None else test
+        losses, errors = _scores(
+            trained.models, pair_data(starts, judges, padded_size(len(judges)))
+        )
+        score = np.asarray(losses if test is None else errors)
     result = FitResult(
-        models=models,
+        **trained._asdict(),
         chosen=best_restart(score, status, loss),
         selection=selection,
         selection_score=score,
         status=status,
-        training_loss=loss,
-        training_accuracy=accuracy,
-        iterations=iterations,
-        error=error,
-        bound_violation=violation,
         seconds=time.perf_counter() - began,
     )
-    if not result.success:
-        warnings.warn(f"fit: {result.message}", RuntimeWarning, stacklevel=2)
+    warn_of_failure(result)
     return result
+
+
+def _selection(
+    n: int, selection: Selection, fraction: float, test: Comparisons | None
+) -> tuple[Selection, int]:
+    """Return how to choose among the restarts, and how many pairs are kept out for that."""
+    if test is not None:
+        instance("test", test, Comparisons)
+    choice("selection", selection, get_args(Selection))
+    fraction = share("validation_fraction", fraction)
+    if (test is None) == (selection == "leaky_test_accuracy"):
+        raise ValueError(
+            'test must be given with selection="leaky_test_accuracy" and only then, '
+            f"got selection={selection!r} and test={'None' if test is None else 'a data set'}"
+        )
+    held = held_out_count(n, fraction) if selection == "validation" else 0
+    if selection == "validation" and not held:
+        warnings.warn(
+            f"fit: {n} comparison(s) are too few to keep some out of training for validation; "
+            "the restart is chosen by training loss",
+            RuntimeWarning,
+            stacklevel=3,
+        )
+        selection = "training_loss"
+    return selection, held
+
+
+class _Trained(NamedTuple):
+    """What `FitResult` says of every restart."""
+
+    models: Any
+    training_loss: Any
+    training_accuracy: Any
+    iterations: Any
+    error: Any
+    bound_violation: Any
+
+
+def _status(trained: _Trained, tol: float) -> np.ndarray:
+    status = np.full(trained.error.shape, "converged", dtype="<U14")
+    status[~(trained.error <= tol)] = "max_iterations"
+    status[~(trained.bound_violation <= BOUND_ROUNDING)] = "out_of_bounds"
+    status[~(np.isfinite(trained.training_loss) & finite_models(trained.models))] = "not_finite"
+    return status
 
 
 def best_restart(score: Any, status: np.ndarray, loss: np.ndarray) -> int | None:
@@ -221,143 +247,51 @@ def best_restart(score: Any, status: np.ndarray, loss: np.ndarray) -> int | None
 @jax.jit(static_argnums=(3, 4))
 def _train(
     starts: Any, data: PairData, settings: tuple[Any, ...], adam_steps: int, split_signs: bool
-) -> tuple[Any, ...]:
+) -> _Trained:
     l2, l1, learning_rate, max_iterations, tol = settings
 
-    def one(start: Any) -> tuple[Any, ...]:
-        lower, upper = start.bounds()
+    def one(start: Any) -> _Trained:
+        bounds = start.bounds()
         loss = partial(objective, data=data, l2=l2, l1=l1)
-        warm = _projected_adam(loss, start, lower, upper, adam_steps, learning_rate)
         model, iterations, error = minimise(
             partial(objective, data=data, l2=l2),
-            warm,
-            (lower, upper),
+            projected_adam(loss, start, bounds, adam_steps, learning_rate),
+            bounds,
             l1=l1 if split_signs else None,
             max_iterations=max_iterations,
             tol=tol,
         )
         outside = jax.tree.map(
-            lambda leaf, low, high: jnp.max(jnp.maximum(low - leaf, leaf - high)),
-            model,
-            lower,
-            upper,
+            lambda leaf, low, high: jnp.max(jnp.maximum(low - leaf, leaf - high)), model, *bounds
         )
         violation = jnp.maximum(jnp.max(jnp.stack(jax.tree.leaves(outside))), 0.0)
         # A maximum may pass over NaN.
         finite = [jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(model)]
         violation = jnp.where(jnp.stack(finite).all(), violation, jnp.nan)
         # Rounding in the solver's Cauchy point; anything larger stays, and is reported.
-        inside = jax.tree.map(jnp.clip, model, lower, upper)
         rounding = violation <= BOUND_ROUNDING
+        inside = jax.tree.map(jnp.clip, model, *bounds)
         model = jax.tree.map(lambda a, b: jnp.where(rounding, a, b), inside, model)
-        hits = _agreement(logits(model, data), data.labels)
-        accuracy = jnp.vdot(data.weights, hits) / jnp.sum(data.weights)
-        return model, loss(model), accuracy, iterations, error, violation
+        accuracy = _accuracy(logits(model, data), data)
+        return _Trained(model, loss(model), accuracy, iterations, error, violation)
 
-    return jax.vmap(one)(starts)
-
-
-def _projected_adam(
-    loss: Any, start: Any, lower: Any, upper: Any, steps: int, learning_rate: Any
-) -> Any:
-    def step(carry: tuple[Any, Any], _: None) -> tuple[tuple[Any, Any], None]:
-        slope = jax.grad(loss)(carry[0])
-        return adam_step(*carry, slope, (lower, upper), learning_rate), None
-
-    inside = jax.tree.map(jnp.clip, start, lower, upper)
-    carry = inside, adam(learning_rate).init(inside)
-    (model, _), _ = jax.lax.scan(step, carry, None, length=steps)
-    return model
+    # One after another: the solver's branches are then branches, compiled in half the time, and
+    # no restart waits for the slowest.
+    trained: _Trained = jax.lax.map(one, starts)
+    return trained
 
 
-def adam(learning_rate: Any) -> Any:
-    """Return Adam with its usual decay rates."""
-    return optax.adam(learning_rate, b1=0.9, b2=0.999)
-
-
-def adam_step(
-    model: Any, memory: Any, slope: Any, bounds: tuple[Any, Any], learning_rate: Any
-) -> tuple[Any, Any]:
-    """Take one step of Adam, projected onto the bounds; return the model and Adam's memory."""
-    updates, memory = adam(learning_rate).update(slope, memory)
-    moved = jax.tree.map(jnp.add, model, updates)
-    return jax.tree.map(jnp.clip, moved, *bounds), memory
-
-
-def _agreement(z: Any, labels: Any) -> Any:
-    """P(the model's answer is the person's), for log-odds z; equal costs count as "first"."""
-    return jnp.where(z >= 0, labels, 1 - labels)
+def _accuracy(z: Any, data: PairData) -> Any:
+    """Return the share of the answers that log-odds z give; equal costs count as "first"."""
+    hits = jnp.where(z >= 0, data.labels, 1 - data.labels)
+    return jnp.vdot(data.weights, hits) / jnp.sum(data.weights)
 
 
 @jax.jit
-def _validation(models: Any, data: PairData) -> tuple[Any, Any]:
+def _scores(models: Any, data: PairData) -> tuple[Any, Any]:
+    """Return the cross-entropy and the share of wrong answers of each model (m,)."""
+
     def one(model: Any) -> tuple[Any, Any]:
-        hits = _agreement(logits(model, data), data.labels)
-        errors = 1 - jnp.vdot(data.weights, hits) / jnp.sum(data.weights)
-        return cross_entropy(model, data), errors
+        return cross_entropy(model, data), 1 - _accuracy(logits(model, data), data)
 
     return jax.vmap(one)(models)
-
-
-def _scores(models: Any, comparisons: Comparisons, kind: str) -> np.ndarray:
-    data = pair_data(models, comparisons, padded_size(len(comparisons)))
-    loss, errors = _validation(models, data)
-    return np.asarray(loss if kind == "loss" else errors)
-
-
-def _starts(
-    comparisons: Comparisons, initial: CostModel | None, restarts: int, key: Any
-) -> CostModel:
-    trajectories, restarts = comparisons.trajectories, positive_int("restarts", restarts)
-    if initial is None:
-        nx, nu = trajectories.x.shape[-1], trajectories.u.shape[-1]
-        return QuadraticCost.random(nx, nu, key=key, shape=(restarts,))
-    return check_starts(comparisons, initial)
-
-
-def check_starts(comparisons: Comparisons, initial: Any) -> CostModel:
-    """Return the starts, stacked along one leading axis, or raise a ValueError."""
-    if isinstance(initial, QuadraticCost) and not initial.batch_shape:
-        initial = jax.tree.map(lambda leaf: leaf[None], initial)
-    check_model("initial", initial, "a stack of σ models")
-    # The weights of a single network may all have the same first dimension.
-    if any(getattr(m, "batch_shape", None) == () for m in getattr(initial, "models", (initial,))):
-        raise ValueError("initial must be stacked along one leading axis, got a single model")
-    sizes = {np.shape(leaf)[:1] for leaf in jax.tree.leaves(initial)}
-    if len(sizes) != 1 or not all(sizes):
-        raise ValueError(f"initial must be stacked along one leading axis, got {sorted(sizes)}")
-    one = jax.tree.map(lambda leaf: leaf[0], initial)
-    try:
-        one(comparisons.trajectories)
-    except ValueError as error:
-        raise ValueError(f"initial must fit the comparisons: {error}") from None
-    return initial
-
-
-def held_out_count(n: int, fraction: float, advice: str = "") -> int:
-    """Return how many of n pairs are kept out of training: at least one, and not all of them."""
-    count = max(1, round(fraction * n))
-    if count >= n:
-        raise ValueError(
-            f"comparisons must hold enough pairs to split for validation, got {n}{advice}"
-        )
-    return count
-
-
-def _check_options(
-    comparisons: Any, selection: str, fraction: float, test: Comparisons | None
-) -> int:
-    """Return the number of pairs to hold out, or raise a ValueError."""
-    instance("comparisons", comparisons, Comparisons)
-    if test is not None:
-        instance("test", test, Comparisons)
-    choice("selection", selection, get_args(Selection))
-    fraction = share("validation_fraction", fraction)
-    if (test is None) == (selection == "leaky_test_accuracy"):
-        raise ValueError(
-            'test must be given with selection="leaky_test_accuracy" and only then, '
-            f"got selection={selection!r} and test={'None' if test is None else 'a data set'}"
-        )
-    if selection != "validation":
-        return 0
-    return held_out_count(len(comparisons), fraction, '; selection="training_loss" needs no split')

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import time
-import warnings
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import expit
 
-from prefmpc._checks import instance, is_whole, positive_int, to_numpy
+from prefmpc._checks import instance, positive_int, share, to_numpy
 from prefmpc._random import generator
+from prefmpc._results import Result, warn_of_failure
 from prefmpc.learning._chart import Chart, Laplace, laplaces, minus_log_posterior
-from prefmpc.learning.convex import Interval, MapResult, new_gaps, split
+from prefmpc.learning.convex import Interval, MapResult
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.preferences.trajectories import Trajectory
 
@@ -33,7 +34,7 @@ SMALLEST_SHARE = 0.1
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Posterior:
+class Posterior(Result):
     """Equally probable (Q, R) after the answers.
 
     Attributes
@@ -51,6 +52,8 @@ class Posterior:
     result : MapResult
         Whose posterior this is.
     """
+
+    NAME = "posterior: the chains disagree"
 
     Q: np.ndarray
     R: np.ndarray
@@ -90,24 +93,13 @@ class Posterior:
         return self.R.std(axis=0)
 
     def probability(self, first: Trajectory, second: Trajectory, level: float = 0.9) -> Interval:
-        """Return P(first is preferred), and how sure we are of that probability.
+        """Return P(first is preferred), and how sure we are of that: see `MapResult.probability`.
 
-        Parameters
-        ----------
-        first, second : Trajectory
-            With equal batch shapes (...).
-        level : float
-            The share of the posterior between the bounds, with equal shares outside.
-
-        Returns
-        -------
-        Interval
-            Three arrays (...). The mean is the probability to bet on.
+        The mean (...) is the probability to bet on.
         """
-        gap, batch, tail = new_gaps(self.result, first, second, level)
-        P = 0.5 * (1 + np.tanh(0.5 * (self.w @ gap)))
-        lower, upper = np.quantile(P, [tail, 1 - tail], axis=0)
-        return Interval(*(part.reshape(batch) for part in (P.mean(axis=0), lower, upper)))
+        tail = (1 - share("level", level)) / 2
+        P = expit(np.tensordot(self.w, self.result.gaps(first, second), 1))
+        return Interval(P.mean(axis=0), *np.quantile(P, [tail, 1 - tail], axis=0))
 
 
 def posterior(result: MapResult, *, draws: int = 1024, key: Any = 0) -> Posterior:
@@ -122,7 +114,7 @@ def posterior(result: MapResult, *, draws: int = 1024, key: Any = 0) -> Posterio
         Its structure must be block-diagonal, or such that its Cholesky factor has the same zeros.
     draws : int
         Number of samples, rounded up to a multiple of 32, at least 256.
-    key : JAX random key, NumPy generator or whole number
+    key : JAX random key or int
         The same key gives the same samples. Another one shows the error of sampling.
 
     Raises
@@ -139,7 +131,7 @@ def posterior(result: MapResult, *, draws: int = 1024, key: Any = 0) -> Posterio
     problem = result.problem
     chart = Chart.of(problem)
     mode = laplaces([problem], [result.minimum.w])[0]
-    rng = np.random.default_rng(key) if is_whole(key) and key >= 0 else generator(key)
+    rng = generator(key)
     p, total = mode.eta.size, WARM_UP + steps
     noise = Noise(
         rng.standard_normal((CHAINS, p)),
@@ -152,7 +144,7 @@ def posterior(result: MapResult, *, draws: int = 1024, key: Any = 0) -> Posterio
     w, acceptance = to_numpy(_sample(chart, mode, noise, *data))
     w, acceptance = w[WARM_UP:], acceptance[WARM_UP:]
     flat = w.reshape(-1, p)
-    Q, R = split(problem.in_user_units(flat), len(result.prior.Q), result.outputs)
+    Q, R = problem.costs(flat)
     out = Posterior(
         Q=Q,
         R=R,
@@ -162,10 +154,7 @@ def posterior(result: MapResult, *, draws: int = 1024, key: Any = 0) -> Posterio
         result=result,
         w=flat,
     )
-    if not out.success:
-        warnings.warn(
-            f"posterior: the chains disagree: {out.message}", RuntimeWarning, stacklevel=2
-        )
+    warn_of_failure(out)
     return out
 
 

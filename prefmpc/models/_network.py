@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal, get_args
+from typing import Any, ClassVar, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -11,9 +11,11 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from prefmpc._checks import (
+    array_module,
     choice,
     finite_array,
     instance,
+    nonnegative,
     positive_int,
     positive_vector,
     require_x64,
@@ -43,6 +45,9 @@ class StageNetwork(Stack):
     floor: float
     even = False
 
+    reading: ClassVar[str]
+    """Name of the weights that v is multiplied with."""
+
     linear_in_features = False
 
     @property
@@ -53,6 +58,39 @@ class StageNetwork(Stack):
     def _units(self, v: Any) -> Any:
         """Return the last layer's units (..., width) for v (..., n_v)."""
         raise NotImplementedError
+
+    def _set(
+        self,
+        layers: dict[str, list[np.ndarray]],
+        shapes: dict[str, list[tuple[int, ...]]],
+        c: ArrayLike,
+        *,
+        scale: ArrayLike,
+        over: Over,
+        floor: float,
+        **options: Any,
+    ) -> None:
+        """Set all fields; a ValueError unless the layers have these shapes after leading ones."""
+        choice("over", over, get_args(Over))
+        size = positive_vector("scale", scale)
+        out = np.asarray(finite_array("c", c))
+        for name, arrays in {**layers, "c": [out]}.items():
+            for i, (array, shape) in enumerate(zip(arrays, shapes[name], strict=True)):
+                if array.shape != (*out.shape[:-1], *shape):
+                    label = name if name == "c" else f"{name}[{i}]"
+                    wanted = (*out.shape[:-1], *shape)
+                    raise ValueError(f"{label} must have shape {wanted}, got {array.shape}")
+        columns = next(iter(layers.values()))[0].shape[-1]
+        multiple = "a multiple of " if over == "trajectory" else ""
+        if (columns % size.size or not columns) if multiple else columns != size.size:
+            raise ValueError(
+                f"{self.reading} must have {multiple}{size.size} columns, the entries of v, "
+                f"got {columns}"
+            )
+        values = {**{name: tuple(arrays) for name, arrays in layers.items()}, "c": out, **options}
+        values |= {"scale": tuple(map(float, size)), "floor": nonnegative("floor", floor)}
+        for name, value in {**values, "over": over}.items():
+            object.__setattr__(self, name, value)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
@@ -73,7 +111,7 @@ class StageNetwork(Stack):
         if self.over == "trajectory":
             steps = self.columns // len(self.scale)
             shaped("trajectory.u", trajectory.u, (steps, nu), "as many steps as the model has")
-        if _plain(features, self):
+        if array_module(features, *jax.tree.leaves(self)) is np:
             return np.asarray(_score(self, features))
         return self.score(features)
 
@@ -81,7 +119,7 @@ class StageNetwork(Stack):
     def features(trajectory: Trajectory) -> Any:
         """Return the stages (x_k, u_k) or their deviations, shape (..., N, nx + nu)."""
         trajectory = trajectory.deviation()
-        xp = np if _plain(trajectory) else jnp
+        xp = array_module(trajectory.x, trajectory.u)
         return xp.concatenate([trajectory.x[..., :-1, :], trajectory.u], axis=-1)
 
     def score(self, features: Any) -> Any:
@@ -95,25 +133,15 @@ class StageNetwork(Stack):
         return (units @ self.c).sum(-1) + self.floor * (v * v).sum((-2, -1))
 
 
-def check_scale(scale: ArrayLike, over: str) -> np.ndarray:
-    """Return the sizes of the signals, or raise a ValueError."""
-    choice("over", over, get_args(Over))
-    return positive_vector("scale", scale)
+def last_size(array: np.ndarray) -> int:
+    """Return the size of the last dimension, 0 if there is none."""
+    return array.shape[-1] if array.ndim else 0
 
 
 def check_layers(name: str, value: Any) -> list[np.ndarray]:
     """Return the weights of all layers as arrays, or raise a ValueError."""
     layers = sequence(name, value, "a sequence of arrays, one a layer")
     return [np.asarray(finite_array(f"{name}[{i}]", layer)) for i, layer in enumerate(layers)]
-
-
-def check_columns(name: str, columns: int, signals: int, over: str) -> None:
-    """Raise a ValueError unless a first layer fits the number of signals."""
-    if (columns % signals or columns == 0) if over == "trajectory" else columns != signals:
-        raise ValueError(
-            f"{name} must have {'a multiple of ' if over == 'trajectory' else ''}{signals} "
-            f"columns, the entries of v, got {columns}"
-        )
 
 
 def drawn_from(
@@ -132,10 +160,6 @@ def drawn_from(
         raise ValueError("widths must name at least one layer, got none")
     n_v = size.size if steps is None else size.size * positive_int("steps", steps)
     return size, [n_v, *sizes], "stage" if steps is None else "trajectory", generator(key)
-
-
-def _plain(*trees: Any) -> bool:
-    return all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(trees))
 
 
 @jax.jit

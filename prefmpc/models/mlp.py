@@ -10,16 +10,15 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import choice, finite_array, leading_shape, nonnegative
+from prefmpc._checks import choice, leading_shape
 from prefmpc._pytree import constant_like, register_pytree
 from prefmpc.models._network import (
     ACTIVATIONS,
     Over,
     StageNetwork,
-    check_columns,
     check_layers,
-    check_scale,
     drawn_from,
+    last_size,
 )
 
 MLPActivation = Literal["relu", "tanh", "softplus"]
@@ -64,6 +63,8 @@ class MLPCost(StageNetwork):
     floor: float
     over: Over
 
+    reading = "W[0]"
+
     def __init__(
         self,
         W: Sequence[ArrayLike],
@@ -76,37 +77,19 @@ class MLPCost(StageNetwork):
         over: Over = "stage",
     ) -> None:
         choice("activation", activation, get_args(MLPActivation))
-        size = check_scale(scale, over)
-        weights, offsets = check_layers("W", W), check_layers("b", b)
-        if not len(weights) == len(offsets) >= 1:
+        layers = {"W": check_layers("W", W), "b": check_layers("b", b)}
+        if not len(layers["W"]) == len(layers["b"]) >= 1:
             raise ValueError(
                 f"W and b must hold the same number of layers, at least one, "
-                f"got {len(weights)} and {len(offsets)}"
+                f"got {len(layers['W'])} and {len(layers['b'])}"
             )
-        out = np.asarray(finite_array("c", c))
-        n_v = weights[0].shape[-1] if weights[0].ndim else 0
-        widths = [n_v, *(offset.shape[-1] if offset.ndim else 0 for offset in offsets)]
-        lead = out.shape[:-1]
-        wanted = {
-            **{f"W[{i}]": widths[i : i + 2][::-1] for i in range(len(weights))},
-            **{f"b[{i}]": [width] for i, width in enumerate(widths[1:])},
-            "c": widths[-1:],
+        widths = [last_size(layers["W"][0]), *map(last_size, layers["b"])]
+        shapes: dict[str, list[tuple[int, ...]]] = {
+            "W": [(after, before) for before, after in itertools.pairwise(widths)],
+            "b": [(width,) for width in widths[1:]],
+            "c": [(widths[-1],)],
         }
-        for (name, shape), array in zip(wanted.items(), [*weights, *offsets, out], strict=True):
-            if array.shape != (*lead, *shape):
-                raise ValueError(f"{name} must have shape {(*lead, *shape)}, got {array.shape}")
-        check_columns("W[0]", n_v, size.size, over)
-        values: dict[str, Any] = {
-            "W": tuple(weights),
-            "b": tuple(offsets),
-            "c": out,
-            "scale": tuple(float(s) for s in size),
-            "activation": activation,
-            "floor": nonnegative("floor", floor),
-            "over": over,
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        self._set(layers, shapes, c, scale=scale, over=over, floor=floor, activation=activation)
 
     @property
     def columns(self) -> int:

@@ -10,16 +10,15 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import choice, finite_array, flag, instance, leading_shape, nonnegative
+from prefmpc._checks import choice, finite_array, flag, instance, leading_shape
 from prefmpc._pytree import bypass_init, constant_like, register_pytree
 from prefmpc.models._network import (
     ACTIVATIONS,
     Over,
     StageNetwork,
-    check_columns,
     check_layers,
-    check_scale,
     drawn_from,
+    last_size,
 )
 from prefmpc.systems.sets import Polyhedron
 
@@ -80,6 +79,8 @@ class ICNNCost(StageNetwork):
     bias: bool
     even: bool
 
+    reading = "V"
+
     def __init__(
         self,
         V: Sequence[ArrayLike],
@@ -96,7 +97,6 @@ class ICNNCost(StageNetwork):
     ) -> None:
         choice("activation", activation, get_args(Activation))
         bias, even = flag("bias", bias), flag("even", even)
-        size = check_scale(scale, over)
         given = {"V": V, "b": b, "U": U}
         layers = {name: check_layers(name, value) for name, value in given.items()}
         if not len(layers["V"]) == len(layers["b"]) == len(layers["U"]) + 1 >= 1:
@@ -104,44 +104,24 @@ class ICNNCost(StageNetwork):
                 "V, b and U must hold L, L and L − 1 layers with L ≥ 1, "
                 f"got {len(layers['V'])}, {len(layers['b'])} and {len(layers['U'])}"
             )
-        layers["c"] = [np.asarray(finite_array("c", c))]
-        widths = [layer.shape[-1] if layer.ndim else 0 for layer in layers["b"]]
-        lead = layers["c"][0].shape[:-1]
-        n_v = layers["V"][0].shape[-1] if layers["V"][0].ndim else 0
-        wanted: dict[str, list[tuple[int, ...]]] = {
+        widths, n_v = [last_size(layer) for layer in layers["b"]], last_size(layers["V"][0])
+        shapes: dict[str, list[tuple[int, ...]]] = {
             "V": [(width, n_v) for width in widths],
             "b": [(width,) for width in widths],
             "U": [(after, before) for before, after in itertools.pairwise(widths)],
             "c": [(widths[-1],)],
         }
-        for name, arrays in layers.items():
-            for i, (array, shape) in enumerate(zip(arrays, wanted[name], strict=True)):
-                label = name if name == "c" else f"{name}[{i}]"
-                if array.shape != (*lead, *shape):
-                    raise ValueError(
-                        f"{label} must have shape {(*lead, *shape)}, got {array.shape}"
-                    )
-                if name == "b" and not bias and array.any():
-                    raise ValueError(f"{label} must be zero for a network without bias")
-                if name in "Uc" and (array < 0).any():
-                    raise ValueError(
-                        f"{label} must not be negative, else σ is not convex; got {array.min():.3g}"
-                    )
-        check_columns("V", n_v, size.size, over)
-        values: dict[str, Any] = {
-            "V": tuple(layers["V"]),
-            "b": tuple(layers["b"]),
-            "U": tuple(layers["U"]),
-            "c": layers["c"][0],
-            "scale": tuple(float(s) for s in size),
-            "activation": activation,
-            "floor": nonnegative("floor", floor),
-            "over": over,
-            "bias": bias,
-            "even": even,
-        }
-        for name, value in values.items():
-            object.__setattr__(self, name, value)
+        options = {"activation": activation, "bias": bias, "even": even}
+        self._set(layers, shapes, c, scale=scale, over=over, floor=floor, **options)
+        for i, offset in enumerate(self.b):
+            if not bias and offset.any():
+                raise ValueError(f"b[{i}] must be zero for a network without bias")
+        signed = {**{f"U[{i}]": layer for i, layer in enumerate(self.U)}, "c": self.c}
+        for name, array in signed.items():
+            if (array < 0).any():
+                raise ValueError(
+                    f"{name} must not be negative, else σ is not convex; got {array.min():.3g}"
+                )
 
     @property
     def columns(self) -> int:
@@ -159,8 +139,7 @@ class ICNNCost(StageNetwork):
         """Return the bounds that keep σ convex as two models: U ≥ 0, c ≥ 0; without bias b = 0."""
         low, high, zero = (constant_like(self, value) for value in (-np.inf, np.inf, 0.0))
         held = {} if self.bias else {"b": zero.b}
-        low = bypass_init(ICNNCost, **{**_fields(low), "U": zero.U, "c": zero.c, **held})
-        return low, bypass_init(ICNNCost, **{**_fields(high), **held})
+        return _with(low, U=zero.U, c=zero.c, **held), _with(high, **held)
 
     @classmethod
     def random(
@@ -198,13 +177,8 @@ class ICNNCost(StageNetwork):
             for before, after in itertools.pairwise(sizes)
         ]
         c = rng.uniform(0, 2 / sizes[-1], (*shape, sizes[-1]))
-        options: dict[str, Any] = {
-            "activation": activation,
-            "floor": floor,
-            "bias": bias,
-            "even": even,
-        }
-        return cls(V, b, U, c, scale=size, over=over, **options)
+        options: dict[str, Any] = {"activation": activation, "bias": bias, "even": even}
+        return cls(V, b, U, c, scale=size, over=over, floor=floor, **options)
 
 
 def soft_constraints(constraints: Polyhedron, weight: ArrayLike) -> ICNNCost:
@@ -237,5 +211,5 @@ def soft_constraints(constraints: Polyhedron, weight: ArrayLike) -> ICNNCost:
 register_pytree(ICNNCost, static=("scale", "activation", "floor", "over", "bias", "even"))
 
 
-def _fields(model: ICNNCost) -> dict[str, Any]:
-    return {field.name: getattr(model, field.name) for field in dataclasses.fields(model)}
+def _with(model: ICNNCost, **values: Any) -> ICNNCost:
+    return bypass_init(ICNNCost, **{**vars(model), **values})

@@ -11,6 +11,7 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import finite_array, is_traced, shaped
 from prefmpc._pytree import bypass_init
+from prefmpc._results import Result
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.preferences.trajectories import Trajectory
 from prefmpc.systems.linear import LinearSystem
@@ -25,7 +26,7 @@ class MPCError(RuntimeError):
 
 
 @dataclasses.dataclass(frozen=True)
-class MPCSolution:
+class MPCSolution(Result):
     """Solution of one MPC problem, or of a batch of them.
 
     Attributes
@@ -52,6 +53,8 @@ class MPCSolution:
         Wall time of the solve.
     """
 
+    GOOD = "solved"
+
     u: np.ndarray
     trajectory: Trajectory
     cost: Any
@@ -61,10 +64,8 @@ class MPCSolution:
     residual: Any
     seconds: float
 
-    @property
-    def success(self) -> bool:
-        """Whether every problem was solved."""
-        return bool(np.all(np.asarray(self.status) == "solved"))
+    def _error(self) -> MPCError:
+        return MPCError(self)
 
 
 class Controller:
@@ -83,8 +84,7 @@ class Controller:
     def __call__(self, x0: ArrayLike) -> np.ndarray:
         """Return the inputs to apply, (..., nu). Raises an `MPCError` if any solve failed."""
         solution = self.solve(x0)
-        if not solution.success:
-            raise MPCError(solution)
+        solution.check()
         self.applied(solution.u)
         return solution.u
 

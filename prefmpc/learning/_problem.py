@@ -1,0 +1,204 @@
+"""The convex problem of the most probable (Q, R), in the form that Newton's method wants."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+
+from prefmpc._checks import finite_array
+from prefmpc.learning.priors import Structure, WishartPrior, free_entries
+from prefmpc.preferences.comparisons import Comparisons
+from prefmpc.preferences.trajectories import Trajectory, second_moments
+
+BLOCK = 4096
+"""Comparisons that are worked on at a time; sizes above are padded to powers of two."""
+
+
+class Entries(NamedTuple):
+    """The free entries w (p,) of W = blkdiag(Q, R) (d, d), lower triangle."""
+
+    rows: Any
+    columns: Any
+    basis: Any
+    """(p, d, d): W = Σ_a w_a·basis_a."""
+
+    @classmethod
+    def of(cls, rows: np.ndarray, columns: np.ndarray) -> Entries:
+        """Prepare the basis."""
+        basis = np.zeros((rows.size,) + (rows.max() + 1,) * 2)
+        number = np.arange(rows.size)
+        basis[number, rows, columns] = basis[number, columns, rows] = 1.0
+        return cls(rows, columns, basis)
+
+    def matrix(self, w: Any) -> Any:
+        """Return W (..., d, d) from w (..., p)."""
+        p, d = self.basis.shape[:2]
+        return (w @ self.basis.reshape(p, d * d)).reshape(*w.shape[:-1], d, d)
+
+    def gradient(self, M: Any) -> Any:
+        """Return the derivative (p,) of tr(M W) with respect to w, for a symmetric M (d, d)."""
+        return self.basis.reshape(len(self.rows), -1) @ M.reshape(-1)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Problem:
+    """Minimise Σ cross-entropy(gapᵀw) − strength·[log det W − tr(mode⁻¹W)] over W ≻ 0.
+
+    In units in which a prior's mode has a unit diagonal: nothing then depends on the units of
+    x and u. W in the user's units is ``W / unit / unit[:, None]``.
+    """
+
+    entries: Entries
+    unit: np.ndarray
+    """(d,)"""
+    outputs: np.ndarray | None
+    """C (ny, nx), where outputs are weighed instead of states."""
+    gap: np.ndarray
+    """(p, size): second moments of the second trajectory minus those of the first."""
+    labels: np.ndarray
+    weights: np.ndarray
+    """(size,): 1 for a comparison, 0 for padding."""
+    mode: np.ndarray
+    strength: float
+    nu: int
+
+    @property
+    def log_unit(self) -> float:
+        """log det W in the problem's units minus that in the user's."""
+        return 2 * float(np.log(self.unit).sum())
+
+    def costs(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return Q (..., nx, nx) and R (..., nu, nu) in the user's units from w (..., p)."""
+        W = np.asarray(self.entries.matrix(w)) / self.unit / self.unit[:, None]
+        nq, C = len(self.unit) - self.nu, self.outputs
+        Q, R = W[..., :nq, :nq], W[..., nq:, nq:]
+        return (Q if C is None else C.T @ Q @ C), R
+
+    def moments(self, trajectories: Trajectory) -> np.ndarray:
+        """Return the derivatives (p, ...) of σ(T) with respect to w."""
+        return _moments(trajectories, self.entries, self.unit, self.outputs)
+
+
+def _moments(
+    trajectories: Trajectory, entries: Entries, unit: np.ndarray, outputs: np.ndarray | None
+) -> np.ndarray:
+    if outputs is not None:
+        plain = trajectories.deviation()
+        trajectories = Trajectory(np.asarray(plain.x) @ outputs.T, plain.u)
+    rows, columns, _ = entries
+    with np.errstate(over="ignore"):
+        moments = _block_diagonal(*(np.asarray(S) for S in second_moments(trajectories)))
+    if not np.isfinite(moments).all():
+        raise ValueError("comparisons must have finite second moments, got an overflow")
+    count = np.where(rows == columns, 1.0, 2.0)
+    return np.moveaxis(moments[..., rows, columns] * (count / (unit[rows] * unit[columns])), -1, 0)
+
+
+def _block_diagonal(Q: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Return blkdiag(Q, R) (..., d, d)."""
+    n, d = Q.shape[-1], Q.shape[-1] + R.shape[-1]
+    W = np.zeros((*Q.shape[:-2], d, d))
+    W[..., :n, :n], W[..., n:, n:] = Q, R
+    return W
+
+
+def build(
+    comparisons: Comparisons,
+    priors: Sequence[WishartPrior],
+    entries: Entries,
+    outputs: np.ndarray | None,
+    size: int,
+) -> list[Problem]:
+    """Prepare one problem for each prior, all in the units of the first.
+
+    Padded to ``size`` comparisons with some of weight 0.
+    """
+    n = len(comparisons)
+    modes = [_block_diagonal(prior.Q, prior.R) for prior in priors]
+    unit = 1 / np.sqrt(np.diag(modes[0]))
+    pool = np.ascontiguousarray(_moments(comparisons.trajectories, entries, unit, outputs))
+    gap = np.zeros((entries.rows.size, size))
+    np.take(pool, comparisons.second, axis=1, out=gap[:, :n])
+    gap[:, :n] -= pool.take(comparisons.first, axis=1)
+    labels, weights = np.zeros(size), np.zeros(size)
+    labels[:n], weights[:n] = comparisons.labels, 1.0
+    data = entries, unit, outputs, gap, labels, weights
+    return [
+        Problem(*data, W0 * unit * unit[:, None], float(prior.strength), len(prior.R))
+        for W0, prior in zip(modes, priors, strict=True)
+    ]
+
+
+def check(
+    data_sets: Sequence[Comparisons],
+    priors: Sequence[WishartPrior],
+    structure: Structure,
+    outputs: ArrayLike | None,
+) -> tuple[np.ndarray | None, Entries]:
+    """Return C and the free entries; raise a ValueError unless everything fits together."""
+    sizes = [(T.x.shape[-1], T.u.shape[-1]) for T in (data.trajectories for data in data_sets)]
+    nx, nu = sizes[0]
+    C = None
+    if outputs is not None:
+        C = np.asarray(finite_array("outputs", outputs, ndim=2))
+        if C.shape[1] != nx:
+            raise ValueError(f"outputs must have {nx} columns, one a state, got shape {C.shape}")
+    nq, what = (nx, "states") if C is None else (C.shape[0], "outputs")
+    for got in sizes:
+        if got != (nx, nu):
+            raise ValueError(
+                f"comparisons must all have {nx} states and {nu} inputs, got {got[0]} and {got[1]}"
+            )
+    for prior in priors:
+        if prior.Q.shape != (nq, nq) or prior.R.shape != (nu, nu):
+            raise ValueError(
+                f"prior must weigh {nq} {what} and {nu} inputs, "
+                f"got Q {prior.Q.shape} and R {prior.R.shape}"
+            )
+        rows, columns = free_entries(structure, prior)
+    return C, Entries.of(rows, columns)
+
+
+def identity(value: Any) -> Any:
+    """Return the value: the sum over devices where there is one only."""
+    return value
+
+
+def loss(z: Any, labels: Any, weights: Any) -> Any:
+    """Return Σ cross-entropy."""
+    # log(1 + e) instead of log1p(e): below 1e-16 nothing is left in the sum anyway, and faster.
+    return weights @ (jnp.maximum(z, 0) + jnp.log(1 + jnp.exp(-jnp.abs(z))) - labels * z)
+
+
+def data_derivatives(
+    gap: Any, z: Any, labels: Any, weights: Any, total: Callable[[Any], Any] = identity
+) -> tuple[Any, Any]:
+    """Return gradient (p,) and Hessian (p, p) of Σ cross-entropy(gapᵀw) where gapᵀw = z.
+
+    One pass over the data; many comparisons go through the cache block by block.
+    """
+    p, size = gap.shape
+    P = jax.nn.sigmoid(z)
+    slope, curvature = weights * (P - labels), weights * P * (1 - P)
+
+    def block(gap: Any, slope: Any, curvature: Any) -> Any:
+        return jnp.concatenate([gap * curvature, slope[None]]) @ gap.T
+
+    def add(k: Any, stacked: Any) -> Any:
+        parts = [
+            jax.lax.dynamic_slice_in_dim(a, k * BLOCK, BLOCK, -1) for a in (gap, slope, curvature)
+        ]
+        return stacked + block(*parts)
+
+    if size <= BLOCK:
+        stacked = block(gap, slope, curvature)
+    else:
+        stacked = jax.lax.fori_loop(0, size // BLOCK, add, jnp.zeros((p + 1, p)))
+    stacked = total(stacked)
+    return stacked[-1], stacked[:-1]
