@@ -255,8 +255,8 @@ def slopes(known: Known, flat: Any, z: Any) -> tuple[Any, Any]:
 
 
 @jax.jit(static_argnums=0)
-def curvature(known: Known, flat: Any, z: Any, multipliers: Any, factor: Any) -> Any:
-    """Return factor·∇²σ + Σ_i multiplier_i ∇²c_i, (n, n)."""
+def curvature(known: Known, flat: Any, z: Any, multipliers: Any) -> Any:
+    """Return ∇²σ + Σ_i multiplier_i ∇²c_i, (n, n)."""
     problem, given, path, X, U = _unpacked(known, flat, z)
     (A, _), Sx, Su = _sensitivities(problem, X, U)
     nx, n = X.shape[1], z.size
@@ -267,9 +267,7 @@ def curvature(known: Known, flat: Any, z: Any, multipliers: Any, factor: Any) ->
     def lagrangian(flat_plan: Any) -> Any:
         x, u = flat_plan[: X.size].reshape(X.shape), flat_plan[X.size :].reshape(U.shape)
         c = jax.vmap(lambda a, b: _on_stage(problem, path, a, b))(x[:-1], u).ravel()
-        return (
-            factor * _cost(problem, given, x, u) + on_stages @ c + at_end @ _at_end(problem, x[-1])
-        )
+        return _cost(problem, given, x, u) + on_stages @ c + at_end @ _at_end(problem, x[-1])
 
     slope = jax.grad(lagrangian)(at)[: X.size].reshape(X.shape)
 
@@ -280,14 +278,14 @@ def curvature(known: Known, flat: Any, z: Any, multipliers: Any, factor: Any) ->
     # λ_{k+1} for k = 0 … N−1: what one unit of x_{k+1} costs from there on.
     _, prices = jax.lax.scan(back, slope[-1], (A, slope[:-1]), reverse=True)
 
-    def bent(x: Any, u: Any, price: Any) -> Any:
+    def dynamics_hessian(x: Any, u: Any, price: Any) -> Any:
         stage = jnp.concatenate([x, u])
         return jax.hessian(lambda w: price @ problem.system.step(w[:nx], w[nx:]))(stage)
 
-    bends = jax.vmap(bent)(X[:-1], U, prices)
+    hessians = jax.vmap(dynamics_hessian)(X[:-1], U, prices)
     stages = jnp.concatenate([Sx[:-1], Su], axis=1)
-    plain = S.T @ jax.hessian(lagrangian)(at) @ S
-    return plain + jnp.einsum("kin,kij,kjm->nm", stages, bends, stages)
+    linearised = S.T @ jax.hessian(lagrangian)(at) @ S
+    return linearised + jnp.einsum("kin,kij,kjm->nm", stages, hessians, stages)
 
 
 @jax.jit(static_argnums=0)
