@@ -109,7 +109,7 @@ def dual_method(
     largest = jnp.max(jnp.stack(sizes), axis=(0, 2))
     Y = Y[0] if len(Y) == 1 else Y[mine]
     g = _Given(Y, order, free, lower, upper, lower == upper, largest)
-    shared = _Given(None if Y.ndim == 2 else 0, None, 0, 0, 0, 0, 0)  # type: ignore[arg-type]
+    shared = _Given(None if Y.ndim == 2 else 0, None, 0, 0, 0, 0, 0)
 
     def mapped(function: Any) -> Any:
         return jax.vmap(function, in_axes=(shared, 0))

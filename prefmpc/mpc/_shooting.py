@@ -218,20 +218,20 @@ def slopes(known: Known, flat: Any, z: Any) -> tuple[Any, Any]:
         return jnp.where(jnp.isfinite(part), jnp.abs(part), 0.0).max(0)
 
     S = jnp.concatenate([Sx.reshape(-1, z.size), Su.reshape(-1, z.size)])
-    descent = jax.grad(lambda x, u: _cost(problem, given, x, u), argnums=(0, 1))
-    (gx, gu), bend = jax.linearize(descent, X, U)
-    rounding = [ROUNDING * largest(part) for part in bend(jnp.abs(X), reach_u)]
+    gradient = jax.grad(lambda x, u: _cost(problem, given, x, u), argnums=(0, 1))
+    (gx, gu), hessian_times = jax.linearize(gradient, X, U)
+    rounding = [ROUNDING * largest(part) for part in hessian_times(jnp.abs(X), reach_u)]
     # Late in a plan all pulls end, and there are inputs that nothing needs: these count beside
     # the largest of their kind, and in shares of their range beside the largest of all.
     limited = jnp.isfinite(problem.system.u_min) & jnp.isfinite(problem.system.u_max)
     shares = jnp.where(limited, jnp.abs(z).reshape(U.shape), 0.0)
     usual = jnp.where(limited, shares.max() * problem.scale.reshape(U.shape), jnp.abs(U).max(0))
-    priced = jnp.maximum(largest(gu), largest(bend(jnp.zeros_like(X), usual)[1]))
+    priced = jnp.maximum(largest(gu), largest(hessian_times(jnp.zeros_like(X), usual)[1]))
     least = joined(
         jnp.broadcast_to(rounding[0], X.shape), jnp.broadcast_to(rounding[1] + priced, U.shape)
     )
-    pull = joined(gx, gu)
-    size = jnp.maximum(jnp.abs(pull), least) @ jnp.abs(S)
+    partials = joined(gx, gu)
+    size = jnp.maximum(jnp.abs(partials), least) @ jnp.abs(S)
 
     on_stage = jax.vmap(lambda x, u: _on_stage(problem, path, x, u))
     cx, cu = jax.vmap(jax.jacfwd(lambda x, u: _on_stage(problem, path, x, u), argnums=(0, 1)))(
@@ -248,7 +248,7 @@ def slopes(known: Known, flat: Any, z: Any) -> tuple[Any, Any]:
     ex = jax.jacfwd(lambda x: _at_end(problem, x))(X[-1])
     limit = jnp.abs(ex @ X[-1] - _at_end(problem, X[-1]))
     ends = jnp.maximum(limit, jnp.abs(ex) @ jnp.abs(X).max(0))
-    table = jnp.concatenate([(pull @ S)[None], size[None], stages, ex @ Sx[-1]])
+    table = jnp.concatenate([(partials @ S)[None], size[None], stages, ex @ Sx[-1]])
     along = jnp.tile(near.max(0), len(U))
     rows = [jnp.concatenate([along, ends]), jnp.concatenate([near.ravel(), ends])]
     return table, jnp.stack(rows)
