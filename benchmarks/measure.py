@@ -27,7 +27,6 @@ PACKAGES = (
     "clarabel",
     "jaxopt",
     "casadi",
-    "ipyopt",
 )
 QUICK = 0.05
 """Work that takes less (in s) is done several times in each round."""

@@ -1,8 +1,8 @@
 """Part "nonlinear": whose minima does nonlinear MPC find, and how long does a solve take?
 
-1. 10 states of a lane change and of a pendulum on a cart: `NonlinearMPC` by both solvers against
-   CasADi with IPOPT (multiple shooting, a program of its own).
-2. Time of a warm solve in closed loop, median and 99th percentile, by horizon and solver.
+1. 10 states of a lane change and of a pendulum on a cart: `NonlinearMPC` against CasADi with IPOPT
+   (multiple shooting, a program of its own).
+2. Time of a warm solve in closed loop, median and 99th percentile, by horizon.
 """
 
 from __future__ import annotations
@@ -35,10 +35,9 @@ import multiple_shooting as peer
 STATES = 10
 HORIZONS = (10, 40)
 STEPS = 25
-SOLVERS = ("slsqp", "ipopt")
 
 
-def lane_change(horizon: int, solver: str, network: bool = False) -> tuple[NonlinearMPC, dict]:
+def lane_change(horizon: int, network: bool = False) -> tuple[NonlinearMPC, dict]:
     """Return the controller of the car, and its set point as an argument of ``solve``."""
     car = kinematic_bicycle()
     reference = steady_state(car, peer.LANE, start=([3.5, 0, 0, 20], [0, 0]))
@@ -55,14 +54,14 @@ def lane_change(horizon: int, solver: str, network: bool = False) -> tuple[Nonli
         a = x[3] ** 2 * jnp.tan(x[2]) / peer.LENGTH
         return jnp.stack([a - peer.LIMIT, -a - peer.LIMIT])
 
-    controller = NonlinearMPC(car, cost, horizon, constraints=limits, path=lateral, solver=solver)
+    controller = NonlinearMPC(car, cost, horizon, constraints=limits, path=lateral)
     return controller, {"reference": reference}
 
 
-def swing_up(horizon: int, solver: str) -> tuple[NonlinearMPC, dict]:
+def swing_up(horizon: int) -> tuple[NonlinearMPC, dict]:
     """Return the controller of the pendulum."""
     cost = QuadraticCost(peer.PENDULUM_Q, peer.PENDULUM_R)
-    return NonlinearMPC(cart_pendulum(), cost, horizon, solver=solver), {}
+    return NonlinearMPC(cart_pendulum(), cost, horizon), {}
 
 
 def compared(controller: NonlinearMPC, options: dict, states: Any, answers: Any) -> dict[str, Any]:
@@ -87,7 +86,7 @@ def compared(controller: NonlinearMPC, options: dict, states: Any, answers: Any)
     return row | {"statuses": ", ".join(f"{count} {s}" for s, count in statuses.items())}
 
 
-def agreement(count: int, solvers: tuple[str, ...], names: tuple[str, ...]) -> dict[str, Any]:
+def agreement(count: int, names: tuple[str, ...]) -> dict[str, Any]:
     """Solve the same problems by ours and by CasADi with IPOPT."""
     problems = {
         "lane change": (10, lane_change, peer.lane_change, peer.lane_changes),
@@ -99,9 +98,7 @@ def agreement(count: int, solvers: tuple[str, ...], names: tuple[str, ...]) -> d
         states = draw(count, np.random.default_rng(1))
         solve = their(horizon)
         answers = [solve(x0) for x0 in states]
-        for solver in solvers:
-            row = compared(*make(horizon, solver), states, answers)
-            rows.append({"name": f"{name}, {solver}", "states": count} | row)
+        rows.append({"name": name, "states": count} | compared(*make(horizon), states, answers))
     columns = {
         "name": "",
         "states": "states",
@@ -133,18 +130,17 @@ def times() -> dict[str, Any]:
     controllers = {
         "lane change": lane_change,
         "pendulum": swing_up,
-        "lane change, MLP": lambda N, solver: lane_change(N, solver, network=True),
+        "lane change, MLP": lambda N: lane_change(N, network=True),
     }
     rows = []
     for name, make in controllers.items():
         states = peer.swing_ups if name == "pendulum" else peer.lane_changes
-        for solver in SOLVERS:
-            for N in HORIZONS:
-                x = states(1, np.random.default_rng(2))[0]
-                seconds, failed = warm_solves(*make(N, solver), x)
-                middle, slow = (float(q) for q in np.quantile(seconds, [0.5, 0.99]))
-                row = {"name": f"{name}, {solver}", "N": N, "seconds": middle}
-                rows.append(row | {"slow_seconds": slow, "failed": failed})
+        for N in HORIZONS:
+            x = states(1, np.random.default_rng(2))[0]
+            seconds, failed = warm_solves(*make(N), x)
+            middle, slow = (float(q) for q in np.quantile(seconds, [0.5, 0.99]))
+            row = {"name": name, "N": N, "seconds": middle}
+            rows.append(row | {"slow_seconds": slow, "failed": failed})
     columns = {"name": "", "N": "N", "seconds": "ms", "slow_seconds": "99 % below, ms"}
     show(f"2. A warm solve, median of {STEPS}", rows, columns | {"failed": "not solved"})
     return {"rows": rows}
@@ -153,5 +149,5 @@ def times() -> dict[str, Any]:
 def run(mini: bool = False) -> dict[str, Any]:
     """Run the part."""
     if mini:
-        return {"agreement": agreement(2, SOLVERS[:1], ("lane change",))}
-    return {"agreement": agreement(STATES, SOLVERS, ("lane change", "pendulum")), "times": times()}
+        return {"agreement": agreement(2, ("lane change",))}
+    return {"agreement": agreement(STATES, ("lane change", "pendulum")), "times": times()}

@@ -272,7 +272,7 @@ def valid_calls():
         "NonlinearMPC": (
             p.NonlinearMPC,
             {
-                **{**MPC, "path": lambda x, u: x[:1] - 9, "terminal": None, "solver": "slsqp"},
+                **{**MPC, "path": lambda x, u: x[:1] - 9, "terminal": None, "solver": "newton"},
                 **{"tol": 1e-4, "max_iterations": 20},
             },
         ),

@@ -30,7 +30,6 @@ COUPLED = Polyhedron(
 )
 TERMINAL = Polyhedron.box([-0.5] * 6, [0.5] * 6)
 SETS = {"constraints": COUPLED, "terminal": TERMINAL}
-SOLVERS = ["slsqp", "ipopt"]
 
 
 def cold(controller, x0, **options):
@@ -53,14 +52,14 @@ def lateral(x, u):
     return jnp.stack([a - casadi.LIMIT, -a - casadi.LIMIT])
 
 
-def car(solver="slsqp", **options):
+def car(**options):
     cost = SignalCost(QuadraticCost(casadi.CAR_Q, casadi.CAR_R), "y")
-    return NonlinearMPC(CAR, cost, N, constraints=LIMITS, path=lateral, solver=solver, **options)
+    return NonlinearMPC(CAR, cost, N, constraints=LIMITS, path=lateral, **options)
 
 
-def pendulum(solver="slsqp", horizon=N, **options):
+def pendulum(horizon=N, **options):
     cost = QuadraticCost(casadi.PENDULUM_Q, casadi.PENDULUM_R)
-    return NonlinearMPC(PENDULUM, cost, horizon, solver=solver, **options)
+    return NonlinearMPC(PENDULUM, cost, horizon, **options)
 
 
 CARRIAGE = LinearSystem([[1, 0.1], [0, 1]], [[0], [0.1]], dt=0.1, u_min=-10, u_max=10)

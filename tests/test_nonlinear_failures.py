@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import jax
 import jax.numpy as jnp
 import multiple_shooting as casadi
@@ -22,7 +20,6 @@ from nonlinear_controllers import (
     PAPER,
     PENDULUM,
     SETS,
-    SOLVERS,
     N,
     car,
     cold,
@@ -41,15 +38,14 @@ from prefmpc import (
     SumCost,
     steady_state,
 )
-from prefmpc.mpc import _nlp
+from prefmpc.mpc import _newton
 
 
 @settings(max_examples=20)
-@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4), st.sampled_from(SOLVERS))
-def test_what_is_solved_is_feasible(where, solver):
+@given(st.lists(st.floats(-1, 1), min_size=4, max_size=4))
+def test_what_is_solved_is_feasible(where):
     x0 = np.array([0, 0, 0, 20]) + np.array(where) * [20, 0.3, 0.02, 9]
-    controller = PROPERTY[solver]
-    answer = cold(controller, x0, reference=LANE)
+    answer = cold(PROPERTY, x0, reference=LANE)
     T = answer.trajectory
     if not answer.success:
         assert np.isnan(answer.u).all()
@@ -62,7 +58,7 @@ def test_what_is_solved_is_feasible(where, solver):
     np.testing.assert_array_equal(T.x[0], x0)
 
 
-PROPERTY = {solver: car(solver) for solver in SOLVERS}
+PROPERTY = car()
 
 
 # ---- what is not solved is said ----
@@ -83,13 +79,12 @@ def flagged(controller, x0, status, words, **options):
     return answer
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_failures_are_flagged(solver):
+def test_failures_are_flagged():
     fast = np.array([0, 0, 0, 31.0])
-    flagged(PROPERTY[solver], fast, "infeasible", "no input sequence", reference=LANE)
-    far = NonlinearMPC(MASSES, PAPER, N, solver=solver, **SETS)
+    flagged(PROPERTY, fast, "infeasible", "no input sequence", reference=LANE)
+    far = NonlinearMPC(MASSES, PAPER, N, **SETS)
     flagged(far, np.array([0.4, 0.4, 0.4, 2, 2, 2]), "infeasible", "no input sequence")
-    hasty = pendulum(solver, max_iterations=1)
+    hasty = pendulum(max_iterations=1)
     flagged(hasty, [0, 3.0, 0, 0], "max_iterations", "not a minimum")
 
 
@@ -97,9 +92,8 @@ LOG = NonlinearSystem(lambda x, u: jnp.log(x) + u, nx=1, nu=1, dt=1, u_min=-2, u
 SMALL = QuadraticCost([[1.0]], [[1.0]])
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_numbers_that_end_are_flagged(solver):
-    controller = NonlinearMPC(LOG, SMALL, 2, solver=solver)
+def test_numbers_that_end_are_flagged():
+    controller = NonlinearMPC(LOG, SMALL, 2)
     flagged(controller, [-1.0], "failed", "f, g, path or σ returns NaN or infinity")
     # The start is fine here and steps into the void are only too long.
     answer = cold(controller, [1.2], start=[[1.0], [0.0]])
@@ -137,34 +131,28 @@ def _one(x, u):
 
 
 @pytest.mark.parametrize("kind", [MLPCost, ICNNCost])
-def test_solves_with_networks_end_in_minima(kind):
+def test_solves_with_networks_end_in_minima(monkeypatch, kind):
     options = {"activation": "tanh" if kind is MLPCost else "softplus", "widths": (6,)}
     network = kind.random([1.0, 1.0, 10.0], key=KEY, **options)
     cost = SumCost([QuadraticCost(0.1 * np.eye(2), [[0.01]]), network])
-    two = [NonlinearMPC(CARRIAGE, cost, N, solver=solver) for solver in SOLVERS]
-    for x in np.random.default_rng(3).uniform(-2, 2, (6, 2)):
-        a, b = (cold(controller, x) for controller in two)
+    controller = NonlinearMPC(CARRIAGE, cost, N)
+    states = np.random.default_rng(3).uniform(-2, 2, (6, 2))
+    by_newton = [cold(controller, x) for x in states]
+    monkeypatch.setattr(_newton, "NEWTON_STEPS", 0)
+    for x, a in zip(states, by_newton, strict=True):
+        b = cold(controller, x)  # by SLSQP alone
         assert a.status == b.status == "solved"
         if a.cost != pytest.approx(b.cost, rel=1e-6):
             assert np.abs(a.trajectory.u - b.trajectory.u).max() > 0.1
 
 
 def test_what_newton_steps_leave_is_solved_by_slsqp(monkeypatch):
-    expected = cold(PROPERTY["slsqp"], [0, 0, 0, 20.0], reference=LANE)
-    monkeypatch.setattr(_nlp, "NEWTON_STEPS", 1)
+    expected = cold(PROPERTY, [0, 0, 0, 20.0], reference=LANE)
+    monkeypatch.setattr(_newton, "NEWTON_STEPS", 1)
     answer = cold(car(), [0, 0, 0, 20.0], reference=LANE)
     assert answer.status == "solved"
     assert answer.iterations > expected.iterations
     assert answer.cost == pytest.approx(expected.cost, rel=1e-6)
-
-
-def test_ipopt_is_asked_for_by_name(monkeypatch):
-    monkeypatch.setitem(sys.modules, "ipyopt", None)
-    with pytest.raises(
-        ImportError, match=r'needs the package ipyopt: pip install "prefmpc\[ipopt\]"'
-    ):
-        pendulum("ipopt")
-    assert pendulum("slsqp").solve([0, 0.1, 0, 0]).success
 
 
 SMOOTH = QuadraticCost(np.eye(4), np.eye(1))
@@ -186,7 +174,7 @@ def mpc(cost=SMOOTH, horizon=2, **options):
         (lambda: mpc(MLPCost.random(np.ones(5), key=KEY, steps=3)), "cost must fit.* trajectory.u"),
         (lambda: mpc(MLPCost.random(np.ones(4), key=KEY)), "cost must fit the system"),
         (lambda: mpc(horizon=0), "horizon must be a whole number of at least 1"),
-        (lambda: mpc(solver="magic"), 'solver must be "slsqp" or "ipopt", got .magic'),
+        (lambda: mpc(solver="magic"), "solver must be .*newton.*, got .magic"),
         (lambda: mpc(tol=-1), "tol must be finite and at least 0"),
         (lambda: mpc(max_iterations=0), "max_iterations must be a whole number"),
         (lambda: mpc(constraints=COUPLED), "constraints must have dimension 5, got 8"),

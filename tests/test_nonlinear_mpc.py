@@ -15,7 +15,6 @@ from nonlinear_controllers import (
     PAPER,
     PENDULUM,
     SETS,
-    SOLVERS,
     TERMINAL,
     N,
     car,
@@ -37,22 +36,20 @@ from prefmpc import (
     steady_state,
     terminal_ingredients,
 )
-from prefmpc.mpc import _nlp
+from prefmpc.mpc import _quadratic
 from studies import RADIUS
 
 NEAR = np.array([0.8, 0.8, 0.8, 0.6, 0.6, 0.6])
 
 
-@pytest.mark.parametrize(("solver", "count", "atol"), [("slsqp", 200, 1e-8), ("ipopt", 40, 1e-5)])
-def test_a_quadratic_program_is_solved_like_one(solver, count, atol):
-    linear, controller = LinearMPC(MASSES, PAPER, N), NonlinearMPC(MASSES, PAPER, N, solver=solver)
+def test_a_quadratic_program_is_solved_like_one():
+    count = 200
+    linear, controller = LinearMPC(MASSES, PAPER, N), NonlinearMPC(MASSES, PAPER, N)
     saturated = 0
     for x in random_states(8 * RADIUS, key=KEY, shape=(count,)):
         expected, answer = linear.solve(x), cold(controller, x)
         assert (answer.status, answer.message) == ("solved", "a local minimum")
-        np.testing.assert_allclose(
-            answer.trajectory.u, expected.trajectory.u, rtol=0, atol=max(atol, 1e-6)
-        )
+        np.testing.assert_allclose(answer.trajectory.u, expected.trajectory.u, rtol=0, atol=1e-6)
         np.testing.assert_array_equal(answer.u, answer.trajectory.u[0])
         assert answer.cost == pytest.approx(expected.cost, rel=1e-6)
         moved = answer.trajectory.x[:-1] @ MASSES.A.T + answer.trajectory.u @ MASSES.B.T
@@ -63,10 +60,9 @@ def test_a_quadratic_program_is_solved_like_one(solver, count, atol):
     assert saturated > count / 2
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_coupled_constraints_and_what_cannot_be_done(solver):
+def test_coupled_constraints_and_what_cannot_be_done():
     linear = LinearMPC(MASSES, PAPER, N, **SETS)
-    controller = NonlinearMPC(MASSES, PAPER, N, solver=solver, **SETS)
+    controller = NonlinearMPC(MASSES, PAPER, N, **SETS)
     seen = {"solved": 0, "infeasible": 0}
     for x in random_states(NEAR, key=KEY, shape=(24,)):
         expected, answer = linear.solve(x), cold(controller, x)
@@ -84,12 +80,11 @@ def test_coupled_constraints_and_what_cannot_be_done(solver):
     assert min(seen.values()) >= 6
 
 
-@pytest.mark.parametrize("solver", SOLVERS)
-def test_a_set_point_is_followed_like_by_the_quadratic_program(solver):
+def test_a_set_point_is_followed_like_by_the_quadratic_program():
     loose = Polyhedron(COUPLED.H, COUPLED.h + 0.5)
     reference = steady_state(MASSES, [0.2, 0.1, 0.0], nearest=True)
     linear = LinearMPC(MASSES, PAPER, N, constraints=loose)
-    controller = NonlinearMPC(MASSES, PAPER, N, constraints=loose, solver=solver)
+    controller = NonlinearMPC(MASSES, PAPER, N, constraints=loose)
     solved = 0
     for x in random_states(NEAR, key=KEY, shape=(10,)):
         expected = linear.solve(x, reference=reference)
@@ -124,7 +119,7 @@ def test_terminal_ingredients_and_an_ellipsoid():
 PROBLEMS = {
     "car": (car, N, casadi.lane_change, casadi.lane_changes, {"reference": LANE}, 1.0),
     "pendulum": (
-        lambda solver="slsqp": pendulum(solver, 20),
+        lambda: pendulum(20),
         20,
         casadi.swing_up,
         casadi.swing_ups,
@@ -137,27 +132,22 @@ PROBLEMS = {
 @pytest.mark.parametrize("name", PROBLEMS)
 def test_the_optimum_is_that_of_casadi(name):
     make, horizon, peer, draw, given_, share = PROBLEMS[name]
-    ours, theirs = {solver: make(solver) for solver in SOLVERS}, peer(horizon)
-    states = draw(50, np.random.default_rng(2))
-    same = dict.fromkeys(SOLVERS, 0)
-    for i, x in enumerate(states):
+    controller, theirs = make(), peer(horizon)
+    same = 0
+    for x in draw(50, np.random.default_rng(2)):
         status, cost, plan = theirs(x)
         assert status == "Solve_Succeeded"
-        for solver, controller in ours.items():
-            if solver == "ipopt" and i >= 15:
-                continue
-            answer = cold(controller, x, **given_)
-            assert answer.status == "solved"
-            if answer.cost == pytest.approx(cost, rel=1e-5):
-                same[solver] += 1
-                continue
-            # Another minimum, not a poor solve: from their plan we stay at their cost.
-            assert np.abs(answer.trajectory.u - plan).max() > 0.1
-            assert answer.residual < 1e-6
-            again = controller.solve(x, start=plan, **given_)
-            assert again.cost == pytest.approx(cost, rel=1e-5)
-    assert same["slsqp"] >= share * 50
-    assert same["ipopt"] >= share * 15
+        answer = cold(controller, x, **given_)
+        assert answer.status == "solved"
+        if answer.cost == pytest.approx(cost, rel=1e-5):
+            same += 1
+            continue
+        # Another minimum, not a poor solve: from their plan we stay at their cost.
+        assert np.abs(answer.trajectory.u - plan).max() > 0.1
+        assert answer.residual < 1e-6
+        again = controller.solve(x, start=plan, **given_)
+        assert again.cost == pytest.approx(cost, rel=1e-5)
+    assert same >= share * 50
 
 
 def test_warm_solves_take_fewer_iterations_and_forget_on_reset():
@@ -226,7 +216,7 @@ def test_derivatives_are_those_of_finite_differences(name):
     z = rng.uniform(-0.3, 0.3, program.lower.size)
     multipliers = rng.uniform(0, 1, program.rows)
     slope, jacobian, *_ = program.slopes(z)
-    H = program.curvature(z, multipliers, 0.7)
+    H = program.curvature(z, multipliers)
     np.testing.assert_allclose(H, H.T, rtol=1e-9, atol=1e-9 * np.abs(H).max())
     for _ in range(4):
         d = rng.normal(size=z.size)
@@ -237,8 +227,8 @@ def test_derivatives_are_those_of_finite_differences(name):
         (g_above, J_above, *_), (g_below, J_below, *_) = (
             program.slopes(z + e * d) for e in (1e-5, -1e-5)
         )
-        bent = 0.7 * (g_above - g_below) + multipliers @ (J_above - J_below)
-        np.testing.assert_allclose(H @ d, bent / 2e-5, atol=1e-6 * (1 + np.abs(H @ d).max()))
+        change = g_above - g_below + multipliers @ (J_above - J_below)
+        np.testing.assert_allclose(H @ d, change / 2e-5, atol=1e-6 * (1 + np.abs(H @ d).max()))
 
 
 def test_quadratic_programs_against_clarabel():
@@ -250,7 +240,7 @@ def test_quadratic_programs_against_clarabel():
         H = root @ root.T + 10.0 ** rng.uniform(-4, 0) * np.eye(n)
         q = rng.normal(size=n) * 10 ** rng.uniform(-2, 3)
         A, b = rng.normal(size=(m, n)), rng.normal(size=m) + 0.7
-        found = _nlp.quadratic_program(H, q, A, b)
+        found = _quadratic.quadratic_program(H, q, A, b)
         d = cp.Variable(n)
         problem = cp.Problem(cp.Minimize(q @ d + cp.quad_form(d, cp.psd_wrap(H)) / 2), [A @ d <= b])
         problem.solve(solver=cp.CLARABEL)

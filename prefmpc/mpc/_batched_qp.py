@@ -86,6 +86,8 @@ def solve(problem: CondensedProblem, x0: Any, tol: Any, *, start: Any = None) ->
     dead = ~jnp.isfinite(data.free).all(-1) | impossible
     start = jnp.zeros_like(data.free) if start is None else start
     none, still, no = jnp.zeros_like(data.free), jnp.zeros((*dead.shape, n)), jnp.zeros_like(dead)
+    # XLA would work out what follows from zeros while it compiles, slowly if they are many.
+    none, still = jax.lax.optimization_barrier((none, still))
     error = _error(data, none, data.free, jnp.ones(dead.shape))
     found = _judged(data, still, none, data.free, error, n, jnp.zeros(dead.shape, int), tol)
     if problem.fixed is None:
@@ -208,14 +210,14 @@ def _active_set(
         # From where λ is: repeated with the same rows it removes rounding errors.
         kept = jnp.where(active, now.multipliers, 0.0)
         rows = data.free - _moved(problem, kept)
-        rest = jnp.where(active, _excess(data, rows, high, low), 0.0)
+        residual = jnp.where(active, _excess(data, rows, high, low), 0.0)
         sizes = jnp.where(active, jnp.abs(data.free) + jnp.abs(rows), 0.0)
         exact = 10 * ROUNDING * jnp.linalg.norm(sizes, axis=-1)
-        more, found = _conjugate_gradients(problem, active, rest, exact, limit=2 * n)
+        correction, trace = _conjugate_gradients(problem, active, residual, exact, limit=2 * n)
         # With the same rows as before there is little left to do, and little to learn from it.
-        softness = jnp.where((active == before).all(-1), jnp.maximum(found, softness), found)
-        rows -= _moved(problem, more)
-        multipliers = kept + more
+        softness = jnp.where((active == before).all(-1), jnp.maximum(trace, softness), trace)
+        rows -= _moved(problem, correction)
+        multipliers = kept + correction
         error = _error(data, multipliers, rows, softness)
         new = _judged(data, now.w, multipliers, rows, error, n, now.iterations + 1, tol)
         new = _kept(idle, now, new)
@@ -251,18 +253,19 @@ def _conjugate_gradients(
         return (carry[0] < limit) & jnp.any(carry[4] > exact**2)
 
     def step(carry: tuple[Any, ...]) -> tuple[Any, ...]:
-        k, multipliers, rest, way, square, inverse, trace = carry
-        turned = jnp.where(active, _moved(problem, way), 0.0)
-        bend = jnp.sum(way * turned, axis=-1)
-        go = (bend > 0) & (square > exact**2)
-        far = jnp.where(go, square / jnp.where(go, bend, 1.0), 0.0)
-        inverse += jnp.where(go, 1 / jnp.where(go, square, 1.0), 0.0)
-        trace += far * square * inverse
-        multipliers, rest = multipliers + far[..., None] * way, rest - far[..., None] * turned
-        next_square = jnp.where(go, jnp.sum(rest * rest, axis=-1), square)
-        ratio = jnp.where(go, next_square / jnp.where(go, square, 1.0), 0.0)
-        way = jnp.where(go[..., None], rest + ratio[..., None] * way, way)
-        return k + 1, multipliers, rest, way, next_square, inverse, trace
+        k, multipliers, rest, direction, square, inverse, trace = carry
+        image = jnp.where(active, _moved(problem, direction), 0.0)
+        curvature = jnp.sum(direction * image, axis=-1)
+        moving = (curvature > 0) & (square > exact**2)
+        length = jnp.where(moving, square / jnp.where(moving, curvature, 1.0), 0.0)
+        inverse += jnp.where(moving, 1 / jnp.where(moving, square, 1.0), 0.0)
+        trace += length * square * inverse
+        multipliers += length[..., None] * direction
+        rest -= length[..., None] * image
+        next_square = jnp.where(moving, jnp.sum(rest * rest, axis=-1), square)
+        ratio = jnp.where(moving, next_square / jnp.where(moving, square, 1.0), 0.0)
+        direction = jnp.where(moving[..., None], rest + ratio[..., None] * direction, direction)
+        return k + 1, multipliers, rest, direction, next_square, inverse, trace
 
     square = jnp.sum(rest * rest, axis=-1)
     nothing = jnp.zeros_like(square)

@@ -170,8 +170,8 @@ def _responses(system: LinearSystem, law: Law, sets: Sets) -> tuple[Any, Any]:
         parts.append(rows.reshape(-1, n + nx))
     if sets.last is not None:
         parts.append(sets.last @ last)
-    both = jnp.concatenate(parts)
-    return both[:, :n], both[:, n:]
+    responses = jnp.concatenate(parts)
+    return responses[:, :n], responses[:, n:]
 
 
 def scaled(
@@ -194,9 +194,9 @@ def scaled(
     fixed = Fixed(still, *nothing, E, limits, jnp.ones(()))
     lower = jnp.concatenate([lower, jnp.full(len(limits), -jnp.inf)])
     upper = jnp.concatenate([upper, limits])
-    both = jnp.concatenate([plan, E + G @ plan])
+    responses = jnp.concatenate([plan, E + G @ plan])
     Y = jnp.concatenate([Y, G @ Y])
-    return _normalised(Y, both, lower, upper, jnp.zeros(len(Y)), fixed, None)
+    return _normalised(Y, responses, lower, upper, jnp.zeros(len(Y)), fixed, None)
 
 
 def _normalised(

@@ -6,7 +6,8 @@ raises the minimum, so that none comes back; a row that cannot be met by moving 
 go of others, is the proof that there is no solution.
 
 Kept of the active rows C, in slots: C itself and its pseudo-inverse, N = (C Cᵀ)⁻¹C, which changes
-by a product of two vectors in each step. All steps of all problems are the same few products.
+by a product of two vectors in each step. What follows is written for one problem and mapped over
+all of them: their steps are the same few products.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.lax import dynamic_index_in_dim
 
 ROOM = 1e-13
 """Rows beyond their limits by less, relative to their size, are not violated."""
@@ -50,7 +52,7 @@ class Dual(NamedTuple):
 
 
 class _Given(NamedTuple):
-    """The problems: Y (b, m, n), or (1, m, n) for all, the rest (b, m) but order (m,)."""
+    """A problem: Y (m, n), the rest (m,)."""
 
     Y: Any
     order: Any
@@ -59,52 +61,38 @@ class _Given(NamedTuple):
     upper: Any
     equal: Any
     largest: Any
-    """The largest of what is given (b,)."""
+    """The largest of what is given, a number."""
 
 
 class _State(NamedTuple):
     w: Any
     C: Any
-    """Active rows, with the sign that makes them upper limits (b, n, n); 0 in free slots."""
+    """Active rows, with the sign that makes them upper limits (n, n); 0 in free slots."""
     N: Any
     target: Any
-    """What C w is at the limits (b, n)."""
+    """What C w is at the limits (n,)."""
     force: Any
-    """Multipliers of the slots (b, n), none negative but those of equalities."""
+    """Multipliers of the slots (n,), none negative but those of equalities."""
     row: Any
-    """Which row a slot holds (b, n); −1 if it is free."""
+    """Which row a slot holds (n,); −1 if it is free."""
     sign: Any
     held: Any
-    """Rows that are active (b, m): what rounding leaves of them is no violation."""
+    """Rows that are active (m,): what rounding leaves of them is no violation."""
     spared: Any
-    """Rows (b, m) that seem violated, depend on the active ones, and may be so by rounding."""
+    """Rows (m,) that seem violated, depend on the active ones, and may be so by rounding."""
     new: Any
-    """The row that is being taken up (b,); −1 between two."""
+    """The row that is being taken up; −1 between two."""
     side: Any
     push: Any
-    """Its multiplier so far (b,)."""
+    """Its multiplier so far."""
     done: Any
     infeasible: Any
     stuck: Any
     count: Any
 
 
-def _of(M: Any, v: Any) -> Any:
-    return jnp.einsum("bij,bj->bi", M, v)
-
-
-def _back(M: Any, v: Any) -> Any:
-    return jnp.einsum("bij,bi->bj", M, v)
-
-
 def _at(array: Any, index: Any) -> Any:
-    return jnp.take_along_axis(array, index[:, None], axis=1)[:, 0]
-
-
-def _rows_of(g: _Given, w: Any) -> Any:
-    if len(g.Y) == 1:
-        return g.free + w @ g.Y[0].T
-    return g.free + _of(g.Y, w)
+    return dynamic_index_in_dim(array, index, keepdims=False)
 
 
 def dual_method(
@@ -119,21 +107,19 @@ def dual_method(
     limit = LIMIT[0] * n + LIMIT[1]
     sizes = [jnp.abs(free), *(jnp.where(jnp.isfinite(a), jnp.abs(a), 0.0) for a in (lower, upper))]
     largest = jnp.max(jnp.stack(sizes), axis=(0, 2))
-    Y = Y if len(Y) == 1 else Y[mine]
+    Y = Y[0] if len(Y) == 1 else Y[mine]
     g = _Given(Y, order, free, lower, upper, lower == upper, largest)
+    shared = _Given(None if Y.ndim == 2 else 0, None, 0, 0, 0, 0, 0)
+
+    def mapped(function: Any) -> Any:
+        return jax.vmap(function, in_axes=(shared, 0))
 
     def round_of(carry: tuple[Any, _State]) -> tuple[Any, _State]:
         def unfinished(s: _State) -> Any:
             return ~jnp.all(s.done) & (jnp.max(s.count) < limit)
 
-        s = _afresh(jax.lax.while_loop(unfinished, lambda s: _step(g, s), carry[1]))
-        # Go on where what was computed afresh breaks a limit.
-        rows = _rows_of(g, s.w)
-        size = jnp.abs(free) + jnp.linalg.norm(s.w, axis=-1)[:, None]
-        broken = (jnp.maximum(rows - upper, lower - rows) > 10 * ROOM * size).any(-1)
-        again = broken & ~skip & ~s.infeasible & ~s.stuck & (s.count < limit)
-        force = jnp.where(again[:, None], jnp.maximum(s.force, 0.0), s.force)
-        return carry[0] + 1, s._replace(done=~again, force=force, new=jnp.where(again, -1, s.new))
+        s = jax.lax.while_loop(unfinished, lambda s: mapped(_step)(g, s), carry[1])
+        return carry[0] + 1, jax.vmap(_afresh, in_axes=(shared, 0, 0, None))(g, s, skip, limit)
 
     zero, none = jnp.zeros((b, n)), jnp.zeros((b, n, n))
     nothing, no, none_yet = jnp.full(b, -1), jnp.zeros(b, bool), jnp.zeros((b, m), bool)
@@ -144,16 +130,13 @@ def dual_method(
     _, end = jax.lax.while_loop(
         lambda carry: (carry[0] < ROUNDS) & ~jnp.all(carry[1].done), round_of, (0, start)
     )
-    place = jnp.where(end.row >= 0, end.row, m)
-    multipliers = jnp.zeros((b, m + 1)).at[jnp.arange(b)[:, None], place].add(end.sign * end.force)
+    multipliers, rows, error = mapped(_found)(g, end)
     limited = ~end.done | (end.count >= limit)
-    rows = _rows_of(g, end.w)
-    error = _error(g, end, rows)
-    return Dual(end.w, multipliers[:, :m], rows, error, end.infeasible, limited, end.count)
+    return Dual(end.w, multipliers, rows, error, end.infeasible, limited, end.count)
 
 
 class _Row(NamedTuple):
-    """The row to take up (b,): which, with which sign, its multiplier, how far it is beyond."""
+    """The row to take up: which, with which sign, its multiplier, how far it is beyond."""
 
     place: Any
     side: Any
@@ -164,40 +147,39 @@ class _Row(NamedTuple):
 
 def _chosen(g: _Given, s: _State, radius: Any) -> _Row:
     """Return the row that was begun with or, if there is none, the worst of the first in order."""
-    rows = _rows_of(g, s.w)
+    rows = g.free + g.Y @ s.w
     over, under = rows - g.upper, g.lower - rows
     beyond = jnp.maximum(over, under)
-    violated = ~(s.held | s.spared) & (beyond > ROOM * (jnp.abs(g.free) + radius[:, None]))
-    share = beyond / (beyond + g.largest[:, None])
-    worst = jnp.argmax(jnp.where(violated, g.order + share, 0.0), axis=-1)
+    violated = ~(s.held | s.spared) & (beyond > ROOM * (jnp.abs(g.free) + radius))
+    share = beyond / (beyond + g.largest)
+    worst = jnp.argmax(jnp.where(violated, g.order + share, 0.0))
     fresh = s.new < 0
     p = jnp.where(fresh, worst, s.new)
-    side = jnp.where(fresh, jnp.where(_at(over, p) >= _at(under, p), 1.0, -1.0), s.side)
-    violation = jnp.where(side > 0, _at(over, p), _at(under, p))
+    above, below = _at(over, p), _at(under, p)
+    side = jnp.where(fresh, jnp.where(above >= below, 1.0, -1.0), s.side)
+    violation = jnp.where(side > 0, above, below)
     return _Row(p, side, jnp.where(fresh, 0.0, s.push), violation, fresh & ~_at(violated, p))
 
 
 def _step(g: _Given, s: _State) -> _State:
     """Move until the chosen row is met, and take it up, or a multiplier is zero, and let it go."""
-    radius = jnp.linalg.norm(s.w, axis=-1)
+    radius = jnp.linalg.norm(s.w)
     row = _chosen(g, s, radius)
-    lanes = jnp.arange(len(row.place)) if len(g.Y) > 1 else 0
-    line = g.Y[lanes, row.place]
-    normal = row.side[:, None] * line
+    normal = row.side * _at(g.Y, row.place)
 
     # Moving by −z lowers the row and keeps the active ones where they are.
-    r = _of(s.N, normal)
-    z = normal - _back(s.C, r)
-    more = _of(s.N, z)
-    r, z = r + more, z - _back(s.C, more)
-    length = jnp.linalg.norm(z, axis=-1)
+    r = s.N @ normal
+    z = normal - r @ s.C
+    again = s.N @ z
+    r, z = r + again, z - again @ s.C
+    length = jnp.linalg.norm(z)
     # What is left of a sum of large terms is rounding.
-    terms = 10 * ROUNDING * (1 + jnp.abs(r).sum(-1))
+    terms = 10 * ROUNDING * (1 + jnp.abs(r).sum())
     moves = length > jnp.maximum(DEPENDENT, terms)
     full = jnp.where(moves, row.violation / jnp.where(moves, length, 1.0) ** 2, jnp.inf)
-    bound = (s.row >= 0) & ~jnp.take_along_axis(g.equal, s.row, axis=1) & (r > 1e-14)
+    bound = (s.row >= 0) & ~g.equal[s.row] & (r > 1e-14)
     room = jnp.where(bound, s.force / jnp.where(bound, r, 1.0), jnp.inf)
-    first = jnp.argmin(room, axis=-1)
+    first = jnp.argmin(room)
     t = jnp.minimum(full, _at(room, first))
 
     blocked = ~row.none & ~jnp.isfinite(t)
@@ -210,14 +192,14 @@ def _step(g: _Given, s: _State) -> _State:
     go = ~(done | spare)
     t = jnp.where(go, t, 0.0)
     add = go & (full <= _at(room, first))
-    force = jnp.maximum(s.force - t[:, None] * r, jnp.where(bound, 0.0, -jnp.inf))
-    here = jnp.arange(g.free.shape[1])[None, :] == row.place[:, None]
+    force = jnp.maximum(s.force - t * r, jnp.where(bound, 0.0, -jnp.inf))
+    here = jnp.arange(len(g.free)) == row.place
     moved = s._replace(
-        w=s.w - (t * moves)[:, None] * z,
+        w=s.w - (t * moves) * z,
         force=force,
         side=row.side,
         push=row.push + t,
-        spared=(s.spared | (spare[:, None] & here)) & ~go[:, None],
+        spared=(s.spared | (spare & here)) & ~go,
         done=done,
         infeasible=s.infeasible | (proof & ~s.done),
         stuck=s.stuck | (nowhere & ~proof & ~s.done),
@@ -229,80 +211,82 @@ def _step(g: _Given, s: _State) -> _State:
 def _exchanged(
     g: _Given, s: _State, row: _Row, way: tuple[Any, Any, Any], add: Any, drop: Any, first: Any
 ) -> _State:
-    """Give a free slot to the row where ``add``, and free the slot ``first`` where ``drop``."""
+    """Give a free slot to the row if ``add``, and free the slot ``first`` if ``drop``."""
     normal, r, z = way
-    n, m = s.row.shape[1], g.free.shape[1]
-    empty = jnp.argmin(s.row >= 0, axis=-1)
-    place = jnp.arange(n) == jnp.where(add, empty, first)[:, None]
-    again = jnp.where(drop, row.place, -1)
-    lines, leaving = jnp.arange(m)[None, :], _at(s.row, first)[:, None]
-    add, drop = add[:, None], drop[:, None]
-    held = (s.held & ~(drop & (lines == leaving))) | (add & (lines == row.place[:, None]))
+    place = jnp.arange(len(s.row)) == jnp.where(add, jnp.argmin(s.row >= 0), first)
+    lines = jnp.arange(len(g.free))
+    held = s.held & ~(drop & (lines == _at(s.row, first))) | (add & (lines == row.place))
 
     # The pseudo-inverse of one row more, or of one less.
-    gone = jnp.take_along_axis(s.N, first[:, None, None], axis=1)[:, 0]
+    gone = _at(s.N, first)
     by = jnp.where(add, z, gone)
-    square = jnp.sum(by * by, axis=-1, keepdims=True)
+    square = by @ by
     square = jnp.where(square > 0, square, 1.0)
-    change = jnp.where(add, jnp.where(place, 1.0, -r), -_of(s.N, gone)) / square
-    N = s.N + jnp.where(add | drop, change, 0.0)[:, :, None] * by[:, None, :]
-    freed, taken = (place & drop)[:, :, None], (place & add)[:, :, None]
-    C = jnp.where(freed, 0.0, jnp.where(taken, normal[:, None, :], s.C))
-    up = row.side > 0
+    change = jnp.where(add, jnp.where(place, 1.0, -r), -(s.N @ gone)) / square
+    N = s.N + jnp.where(add | drop, change, 0.0)[:, None] * by
+    freed, taken = place & drop, place & add
     free = _at(g.free, row.place)
-    limit = jnp.where(up, _at(g.upper, row.place) - free, free - _at(g.lower, row.place))
+    above, below = _at(g.upper, row.place) - free, free - _at(g.lower, row.place)
+    limit = jnp.where(row.side > 0, above, below)
 
     def put(old: Any, new: Any, nothing: float) -> Any:
-        old = jnp.where(place & add, new[:, None], old)
-        return jnp.where(place & drop, nothing, old)
+        return jnp.where(freed, nothing, jnp.where(taken, new, old))
 
     return s._replace(
-        C=C,
-        N=jnp.where(freed, 0.0, N),
+        C=jnp.where(freed[:, None], 0.0, jnp.where(taken[:, None], normal, s.C)),
+        N=jnp.where(freed[:, None], 0.0, N),
         target=put(s.target, limit, 0.0),
         force=put(s.force, s.push, 0.0),
         row=put(s.row, row.place, -1),
         sign=put(s.sign, row.side, 0.0),
         held=held,
-        new=again,
+        new=jnp.where(drop, row.place, -1),
     )
 
 
-def _afresh(s: _State) -> _State:
-    """Compute w and the multipliers from the active rows alone."""
-    w = _back(s.N, s.target)
+def _afresh(g: _Given, s: _State, skip: Any, limit: Any) -> _State:
+    """Compute w and multipliers from the active rows alone; go on if that breaks a limit."""
+    w = s.target @ s.N
     for _ in range(2):
-        w = w + _back(s.N, s.target - _of(s.C, w))
-    force = -_of(s.N, w)
+        w = w + (s.target - s.C @ w) @ s.N
+    force = -(s.N @ w)
     for _ in range(2):
-        force = force - _of(s.N, w + _back(s.C, force))
-    return s._replace(w=w, force=force)
+        force = force - s.N @ (w + force @ s.C)
+    rows = g.free + g.Y @ w
+    size = jnp.abs(g.free) + jnp.linalg.norm(w)
+    broken = (jnp.maximum(rows - g.upper, g.lower - rows) > 10 * ROOM * size).any()
+    again = broken & ~skip & ~s.infeasible & ~s.stuck & (s.count < limit)
+    force = jnp.where(again, jnp.maximum(force, 0.0), force)
+    return s._replace(w=w, force=force, done=~again, new=jnp.where(again, -1, s.new))
 
 
-def _error(g: _Given, end: _State, rows: Any) -> Any:
-    """Estimate the largest error of one of the first n rows, from what w and λ are, not how.
+def _found(g: _Given, end: _State) -> tuple[Any, Any, Any]:
+    """Return multipliers and rows (m,), and an estimate of the largest error of the first n rows.
 
-    How far active rows are from their limits, rounding included, moves the other rows by Y N, and
-    active ones not at all. A multiplier too small to be sure of its sign is another error, as is
-    the part of w that the active rows do not span, and a row beyond its limits.
+    From what w and λ are, not how. How far active rows are from their limits, rounding included,
+    moves the other rows by Y N, and active ones not at all. A multiplier too small to be sure of
+    its sign is another error, as is the part of w that the active rows do not span, and a row
+    beyond its limits.
     """
-    n = g.Y.shape[2]
-    inputs = g.Y[:, :n]
-    radius = jnp.linalg.norm(end.w, axis=-1)[:, None]
+    m, n = g.Y.shape
+    slots = jnp.arange(m)[:, None] == end.row  # a free one is no row's
+    multipliers = slots @ (end.sign * end.force)
+    rows = g.free + g.Y @ end.w
+    inputs, active, radius = g.Y[:n], slots[:n].any(-1), jnp.linalg.norm(end.w)
     held = end.row >= 0
-    miss = jnp.abs(_of(end.C, end.w) - end.target)
+    miss = jnp.abs(end.C @ end.w - end.target)
     miss = jnp.where(held, miss + ROUNDING * (jnp.abs(end.target) + radius), 0.0)
-    spread = jnp.abs(inputs @ end.N.swapaxes(1, 2))
-    astray = end.w - _back(end.C, _of(end.N, end.w))
-    astray = astray - _back(end.C, _of(end.N, astray))
-    aside = jnp.abs(inputs @ astray[..., None])[..., 0]
-    active = (jnp.arange(n)[None, :, None] == end.row[:, None, :]).any(-1)
-    moved = (_of(spread, miss) + jnp.where(active, 0.0, aside)).max(-1)
+    spread = jnp.abs(inputs @ end.N.T)
+    astray = end.w
+    for _ in range(2):
+        astray = astray - (end.N @ astray) @ end.C
+    aside = jnp.abs(inputs @ astray)
+    moved = (spread @ miss + jnp.where(active, 0.0, aside)).max()
     weights = jnp.linalg.norm(end.N, axis=-1)
     unsure = ROUNDING * weights * radius
-    free = jnp.take_along_axis(g.equal, end.row, axis=1)
+    free = g.equal[end.row]
     wrong = jnp.where(held & ~free & (end.force < unsure), unsure - jnp.minimum(end.force, 0), 0.0)
-    beyond = jnp.maximum(jnp.maximum(rows - g.upper, g.lower - rows), 0.0).max(-1)
-    softness = jnp.sqrt(jnp.sum(weights**2, axis=-1))
-    large = jnp.where(beyond > 100 * ROOM * (jnp.abs(rows).max(-1) + radius[:, 0]), softness, 1.0)
-    return moved + wrong.max(-1) + large * beyond
+    beyond = jnp.maximum(jnp.maximum(rows - g.upper, g.lower - rows), 0.0).max()
+    softness = jnp.linalg.norm(weights)
+    large = jnp.where(beyond > 100 * ROOM * (jnp.abs(rows).max() + radius), softness, 1.0)
+    return multipliers, rows, moved + wrong.max() + large * beyond

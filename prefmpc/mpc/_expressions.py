@@ -133,8 +133,8 @@ def stage_limits(
     for pattern in np.unique(wanted, axis=1).T:
         rows, stages = (wanted == pattern[:, None]).all(axis=0), np.flatnonzero(pattern)
         if rows.any() and stages.size:
-            both = cp.hstack([X[stages], U[stages]])
-            limits.append(both @ H[rows].T <= np.tile(h[rows], (stages.size, 1)))
+            stacked = cp.hstack([X[stages], U[stages]])
+            limits.append(stacked @ H[rows].T <= np.tile(h[rows], (stages.size, 1)))
     for i, cone in enumerate(output_cones):
         free = np.ones(X.shape[0], dtype=bool) if fixed is None else ~fixed[1][i]
         if not free.any():

@@ -44,5 +44,5 @@ def row_sizes(A: Any, B: Any, u_size: Any, x0: Any, Hx: Any, h: Any) -> Any:
 def input_size(u_min: Any, u_max: Any) -> Any:
     """Return the largest size (nu,) of each input, 0 where it has no limit."""
     xp = array_module(u_min)
-    both = xp.stack([xp.abs(u_min), xp.abs(u_max)])
-    return xp.where(xp.isfinite(both), both, 0.0).max(0)
+    bounds = xp.stack([xp.abs(u_min), xp.abs(u_max)])
+    return xp.where(xp.isfinite(bounds), bounds, 0.0).max(0)

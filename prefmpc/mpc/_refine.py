@@ -31,9 +31,9 @@ class Refiner:
         # The matrix of the optimality conditions, once; what is not active is masked out of it.
         rows = self._rows.tocoo()
         weights = self._P.tocoo()
-        every = np.arange(n + m)
-        i = np.concatenate([weights.row, rows.row + n, rows.col, every])
-        j = np.concatenate([weights.col, rows.col, rows.row + n, every])
+        diagonal = np.arange(n + m)
+        i = np.concatenate([weights.row, rows.row + n, rows.col, diagonal])
+        j = np.concatenate([weights.col, rows.col, rows.row + n, diagonal])
         order = np.lexsort((i, j))
         self._shape, self._i = (n + m, n + m), i[order].astype(np.int32)
         self._starts = np.searchsorted(j[order], np.arange(n + m + 1)).astype(np.int32)

@@ -218,20 +218,20 @@ def slopes(known: Known, flat: Any, z: Any) -> tuple[Any, Any]:
         return jnp.where(jnp.isfinite(part), jnp.abs(part), 0.0).max(0)
 
     S = jnp.concatenate([Sx.reshape(-1, z.size), Su.reshape(-1, z.size)])
-    descent = jax.grad(lambda x, u: _cost(problem, given, x, u), argnums=(0, 1))
-    (gx, gu), bend = jax.linearize(descent, X, U)
-    rounding = [ROUNDING * largest(part) for part in bend(jnp.abs(X), reach_u)]
+    gradient = jax.grad(lambda x, u: _cost(problem, given, x, u), argnums=(0, 1))
+    (gx, gu), hessian_times = jax.linearize(gradient, X, U)
+    rounding = [ROUNDING * largest(part) for part in hessian_times(jnp.abs(X), reach_u)]
     # Late in a plan all pulls end, and there are inputs that nothing needs: these count beside
     # the largest of their kind, and in shares of their range beside the largest of all.
     limited = jnp.isfinite(problem.system.u_min) & jnp.isfinite(problem.system.u_max)
     shares = jnp.where(limited, jnp.abs(z).reshape(U.shape), 0.0)
     usual = jnp.where(limited, shares.max() * problem.scale.reshape(U.shape), jnp.abs(U).max(0))
-    priced = jnp.maximum(largest(gu), largest(bend(jnp.zeros_like(X), usual)[1]))
+    priced = jnp.maximum(largest(gu), largest(hessian_times(jnp.zeros_like(X), usual)[1]))
     least = joined(
         jnp.broadcast_to(rounding[0], X.shape), jnp.broadcast_to(rounding[1] + priced, U.shape)
     )
-    pull = joined(gx, gu)
-    size = jnp.maximum(jnp.abs(pull), least) @ jnp.abs(S)
+    partials = joined(gx, gu)
+    size = jnp.maximum(jnp.abs(partials), least) @ jnp.abs(S)
 
     on_stage = jax.vmap(lambda x, u: _on_stage(problem, path, x, u))
     cx, cu = jax.vmap(jax.jacfwd(lambda x, u: _on_stage(problem, path, x, u), argnums=(0, 1)))(
@@ -248,15 +248,15 @@ def slopes(known: Known, flat: Any, z: Any) -> tuple[Any, Any]:
     ex = jax.jacfwd(lambda x: _at_end(problem, x))(X[-1])
     limit = jnp.abs(ex @ X[-1] - _at_end(problem, X[-1]))
     ends = jnp.maximum(limit, jnp.abs(ex) @ jnp.abs(X).max(0))
-    table = jnp.concatenate([(pull @ S)[None], size[None], stages, ex @ Sx[-1]])
+    table = jnp.concatenate([(partials @ S)[None], size[None], stages, ex @ Sx[-1]])
     along = jnp.tile(near.max(0), len(U))
     rows = [jnp.concatenate([along, ends]), jnp.concatenate([near.ravel(), ends])]
     return table, jnp.stack(rows)
 
 
 @jax.jit(static_argnums=0)
-def curvature(known: Known, flat: Any, z: Any, multipliers: Any, factor: Any) -> Any:
-    """Return factor·∇²σ + Σ_i multiplier_i ∇²c_i, (n, n)."""
+def curvature(known: Known, flat: Any, z: Any, multipliers: Any) -> Any:
+    """Return ∇²σ + Σ_i multiplier_i ∇²c_i, (n, n)."""
     problem, given, path, X, U = _unpacked(known, flat, z)
     (A, _), Sx, Su = _sensitivities(problem, X, U)
     nx, n = X.shape[1], z.size
@@ -267,9 +267,7 @@ def curvature(known: Known, flat: Any, z: Any, multipliers: Any, factor: Any) ->
     def lagrangian(flat_plan: Any) -> Any:
         x, u = flat_plan[: X.size].reshape(X.shape), flat_plan[X.size :].reshape(U.shape)
         c = jax.vmap(lambda a, b: _on_stage(problem, path, a, b))(x[:-1], u).ravel()
-        return (
-            factor * _cost(problem, given, x, u) + on_stages @ c + at_end @ _at_end(problem, x[-1])
-        )
+        return _cost(problem, given, x, u) + on_stages @ c + at_end @ _at_end(problem, x[-1])
 
     slope = jax.grad(lagrangian)(at)[: X.size].reshape(X.shape)
 
@@ -280,14 +278,14 @@ def curvature(known: Known, flat: Any, z: Any, multipliers: Any, factor: Any) ->
     # λ_{k+1} for k = 0 … N−1: what one unit of x_{k+1} costs from there on.
     _, prices = jax.lax.scan(back, slope[-1], (A, slope[:-1]), reverse=True)
 
-    def bent(x: Any, u: Any, price: Any) -> Any:
+    def dynamics_hessian(x: Any, u: Any, price: Any) -> Any:
         stage = jnp.concatenate([x, u])
         return jax.hessian(lambda w: price @ problem.system.step(w[:nx], w[nx:]))(stage)
 
-    bends = jax.vmap(bent)(X[:-1], U, prices)
+    hessians = jax.vmap(dynamics_hessian)(X[:-1], U, prices)
     stages = jnp.concatenate([Sx[:-1], Su], axis=1)
-    plain = S.T @ jax.hessian(lagrangian)(at) @ S
-    return plain + jnp.einsum("kin,kij,kjm->nm", stages, bends, stages)
+    linearised = S.T @ jax.hessian(lagrangian)(at) @ S
+    return linearised + jnp.einsum("kin,kij,kjm->nm", stages, hessians, stages)
 
 
 @jax.jit(static_argnums=0)

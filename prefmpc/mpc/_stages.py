@@ -95,8 +95,8 @@ class StageProgram:
         if constraints is not None:
             H, h = per_unit(constraints.H * np.concatenate([self.dx, self.du]), constraints.h)
             stages = sp.hstack([sp.eye_array(N), sp.csr_array((N, 1))])
-            both = [sp.kron(stages, H[:, :nx]), sp.kron(sp.eye_array(N), H[:, nx:])]
-            sets.append((sp.hstack(both).tocsr(), np.tile(h, N), self.fixed.stage.ravel()))
+            parts = [sp.kron(stages, H[:, :nx]), sp.kron(sp.eye_array(N), H[:, nx:])]
+            sets.append((sp.hstack(parts).tocsr(), np.tile(h, N), self.fixed.stage.ravel()))
         if terminal is not None:
             H, h = per_unit(terminal.H * self.dx, terminal.h)
             before, after = sp.csr_array((len(h), N * nx)), sp.csr_array((len(h), inputs))
@@ -155,8 +155,8 @@ class StageProgram:
 
     def _at_most(self, bounds: Bounds, z: np.ndarray, y: np.ndarray) -> float:
         """Return what the residual cannot exceed; all that an exact answer has to pass."""
-        both = self._conditions @ np.concatenate([z, y])
-        slope, at = both[: len(z)], both[len(z) :]
+        left = self._conditions @ np.concatenate([z, y])
+        slope, at = left[: len(z)], left[len(z) :]
         beyond = np.maximum(at - bounds.upper, bounds.lower - at)
         told = y.nonzero()[0]
         w, at = y[told], at[told]
@@ -169,21 +169,21 @@ class StageProgram:
         slopes = X @ self._Q, U @ self._R
         slopes[0][-1] = X[-1] @ self._last
         L, w = y[: self.equations].reshape(-1, self._nx), y[self.equations :]
-        pulls = self.split(self._limits_by_columns @ w)
-        drive = L[1:] @ self._B
-        on_x, on_u = slopes[0] - L + pulls[0], slopes[1] + drive + pulls[1]
+        from_limits = self.split(self._limits_by_columns @ w)
+        from_dynamics = L[1:] @ self._B
+        on_x, on_u = slopes[0] - L + from_limits[0], slopes[1] + from_dynamics + from_limits[1]
         on_x[:-1] += L[1:] @ self._A
-        moved = X.copy()
-        moved[0] += bounds.lower[: self._nx]
-        moved[1:] -= X[:-1] @ self._A.T + U @ self._B.T
+        defect = X.copy()
+        defect[0] += bounds.lower[: self._nx]
+        defect[1:] -= X[:-1] @ self._A.T + U @ self._B.T
         at, low, high = self._limits_by_rows @ z, *self._of_limits(bounds)
         room = np.where(w > 0, high - at, at - low)[w != 0]
         beyond = np.maximum(at - high, low - at) / np.maximum(FLOOR, np.abs(at))
         worth = np.maximum(FLOOR, self.objective(z))
         parts = [
             _relative(on_x, slopes[0], L),
-            _relative(on_u, slopes[1], drive),
-            _relative(moved, X, X),
+            _relative(on_u, slopes[1], from_dynamics),
+            _relative(defect, X, X),
             beyond.max(initial=0.0),
             np.abs(w[w != 0] * room).max(initial=0.0) / worth,
         ]

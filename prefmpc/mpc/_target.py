@@ -137,14 +137,14 @@ def _within(
     moving = np.linalg.svd(rest, full_matrices=True)[0][:, rest.shape[1] :]
     size = np.abs(reach @ moving).max(initial=0.0)
     slopes = reach @ moving / (size if size > 0 else 1.0)
-    wide = np.concatenate([slopes, np.zeros((len(slopes), rest.shape[1]))], axis=1)
-    both = np.concatenate([moving, rest], axis=1)
-    first = _program(wide.T @ wide, -wide.T @ (wide @ (both.T @ near)), H @ both, h)
+    padded = np.concatenate([slopes, np.zeros((len(slopes), rest.shape[1]))], axis=1)
+    basis = np.concatenate([moving, rest], axis=1)
+    first = _program(padded.T @ padded, -padded.T @ (padded @ (basis.T @ near)), H @ basis, h)
     if first is None or not rest.shape[1]:
-        return None if first is None else both @ first
+        return None if first is None else basis @ first
     start = moving @ first[: moving.shape[1]]
     second = _program(np.eye(rest.shape[1]), np.zeros(rest.shape[1]), H @ rest, h - H @ start)
-    return both @ first if second is None else start + rest @ second
+    return basis @ first if second is None else start + rest @ second
 
 
 def _program(P: np.ndarray, q: np.ndarray, H: np.ndarray, h: np.ndarray) -> np.ndarray | None:

@@ -55,12 +55,12 @@ def own_units(program: Program, guess: np.ndarray, inputs: int) -> tuple[Program
     their limit are taken to be on it.
     """
     slopes = program.slopes(guess)
-    bend = np.abs(np.diag(program.curvature(guess, np.zeros(program.rows), 1.0)))
+    curvature = np.abs(np.diag(program.curvature(guess, np.zeros(program.rows))))
     free = program.upper > program.lower
     open_ended = free & ~np.isfinite(program.upper - program.lower)
     z = np.ones(guess.size)
     if open_ended.any():
-        slope, curve = (part.reshape(-1, inputs).max(0) for part in (slopes.size, bend))
+        slope, curve = (part.reshape(-1, inputs).max(0) for part in (slopes.size, curvature))
         known = np.stack([guess, program.lower, program.upper]).reshape(3, -1, inputs)
         known = np.where(np.isfinite(known), np.abs(known), 0.0).max((0, 1))
         with np.errstate(all="ignore"):
@@ -68,7 +68,7 @@ def own_units(program: Program, guess: np.ndarray, inputs: int) -> tuple[Program
         step = np.tile(_power(step), guess.size // inputs)
         z[open_ended] = step[open_ended]
     size = float((slopes.size * z)[free].max(initial=0.0))
-    f = _power(size if size > 0 else (bend * z**2)[free].max(initial=0.0))
+    f = _power(size if size > 0 else (curvature * z**2)[free].max(initial=0.0))
     c = _power(np.where(slopes.near > 0, slopes.near, slopes.rows))
     now = program.values(guess)[1]
     still = ~slopes.jacobian.any(axis=1) & (now <= ON_LIMIT * slopes.near)
@@ -107,8 +107,8 @@ def _converted(program: Program, units: Units) -> Program:
             out.near / units.c,
         )
 
-    def curvature(z: np.ndarray, multipliers: np.ndarray, factor: float) -> np.ndarray:
-        H = program.curvature(units.whole(z), multipliers * (units.f / units.c), factor)
+    def curvature(z: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
+        H = program.curvature(units.whole(z), multipliers * (units.f / units.c))
         return (H if everything else H[np.ix_(free, free)]) * steps
 
     lower, upper = units.part(program.lower), units.part(program.upper)

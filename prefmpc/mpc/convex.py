@@ -28,11 +28,12 @@ from prefmpc.mpc._fixed import FixedCone, FixedRows
 from prefmpc.mpc.solution import (
     Controller,
     MPCSolution,
+    Outcome,
     check_dimension,
     check_single_state,
+    explained,
     fixed_message,
     mpc_solution,
-    no_plan,
 )
 from prefmpc.mpc.stability import StabilityCheck
 from prefmpc.mpc.terminal import TerminalIngredients, check_polyhedron, terminal_set
@@ -159,11 +160,12 @@ class ConvexMPC(Controller):
         state = check_single_state(x0, self.system.nx)
         began = time.perf_counter()
         if self._rows.broken(state) or any(cone.broken(state) for cone in self._cones):
-            return no_plan(self.system, self.horizon, "infeasible", fixed_message(state), began)
+            outcome = Outcome("infeasible", fixed_message(state))
+            return mpc_solution(self.system, self.horizon, outcome, began)
         dx, du = self._units
         found, (states, inputs) = self._program.solve(state / dx)
         if self._aside:
             states = states + self._drift @ (state / dx)
         plan = states * dx, inputs * du
-        cost, limited = found.objective, self._limited
-        return mpc_solution(self.system, state, plan, cost, found, began, limited=limited)
+        outcome = explained(found, state, self.horizon, limited=self._limited)
+        return mpc_solution(self.system, self.horizon, outcome, began, plan, found.objective)

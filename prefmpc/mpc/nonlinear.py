@@ -24,16 +24,19 @@ from prefmpc._checks import (
 )
 from prefmpc._pytree import bypass_init
 from prefmpc.models.quadratic import CostModel, check_model
-from prefmpc.mpc import _nlp
 from prefmpc.mpc import _shooting as shooting
 from prefmpc.mpc._limits import ON_LIMIT
+from prefmpc.mpc._newton import attempt, least_violation
+from prefmpc.mpc._nlp import Attempt, Program, promising, remembered
 from prefmpc.mpc._shooting import Given, Known, Problem
-from prefmpc.mpc._units import own_units
+from prefmpc.mpc._units import Units, own_units
 from prefmpc.mpc.solution import (
     Controller,
     MPCSolution,
+    Outcome,
     check_single_state,
     infeasible_message,
+    mpc_solution,
 )
 from prefmpc.mpc.steady import SteadyState, check_reference, with_reference
 from prefmpc.mpc.terminal import TerminalIngredients, check_polyhedron, terminal_set
@@ -42,7 +45,7 @@ from prefmpc.systems.linear import System
 from prefmpc.systems.nonlinear import traced_shape
 from prefmpc.systems.sets import Ellipsoid, Polyhedron
 
-Solver = Literal["slsqp", "ipopt"]
+Solver = Literal["newton"]
 
 
 class NonlinearMPC(Controller):
@@ -67,9 +70,9 @@ class NonlinearMPC(Controller):
         In `jax.numpy`; path(x_k, u_k) ≤ 0 for k = 0 … N−1.
     terminal : Polyhedron, Ellipsoid or TerminalIngredients, optional
         X_N; or the ingredients, whose polyhedron is X_N and whose x_NᵀPx_N is added to the cost.
-    solver : {"slsqp", "ipopt"}
-        Newton steps on quadratic programs, with SciPy's SLSQP where these do not arrive; or IPOPT
-        (``pip install prefmpc[ipopt]``). Both with exact second derivatives.
+    solver : "newton"
+        Newton steps with exact second derivatives, each a quadratic program; where these get
+        stuck, SciPy's SLSQP takes over.
     tol : float
         How far ∇σ may be from what active constraints balance, relative to the size of the terms
         that it is the sum of: in any units of σ, states and inputs the same.
@@ -79,8 +82,6 @@ class NonlinearMPC(Controller):
     ------
     ValueError
         If an argument is out of range or a dimension does not fit.
-    ImportError
-        If IPOPT is asked for and `ipyopt` is not installed.
     """
 
     def __init__(
@@ -92,7 +93,7 @@ class NonlinearMPC(Controller):
         constraints: Polyhedron | None = None,
         path: Callable[[Any, Any], Any] | None = None,
         terminal: Polyhedron | Ellipsoid | TerminalIngredients | None = None,
-        solver: Solver = "slsqp",
+        solver: Solver = "newton",
         tol: float = 1e-4,
         max_iterations: int = 200,
     ) -> None:
@@ -101,8 +102,6 @@ class NonlinearMPC(Controller):
         single("system", system)
         single("cost", cost)
         choice("solver", solver, get_args(Solver))
-        if solver == "ipopt":
-            _nlp.need_ipopt()
         self.system, self.cost = system, cost
         self.horizon = positive_int("horizon", horizon)
         self.solver, self.tol = solver, nonnegative("tol", tol)
@@ -188,49 +187,54 @@ class NonlinearMPC(Controller):
         with self._lock:
             packed = self._packed(state, reference, u_before)
             program = self._program(*packed)
-            tries, message = self._tried(program, state, self._starts(program, reference, start))
-            return self._solution(packed, reference, tries, message, began)
+            tries, refusal = self._tried(program, state, self._starts(program, reference, start))
+            solution = self._solution(packed, tries, refusal, began)
+        return with_reference(solution, reference)
 
     def _tried(
-        self, program: _nlp.Program, state: np.ndarray, guesses: list[np.ndarray]
-    ) -> tuple[list[_nlp.Attempt], str]:
-        """Return what came of each start, the last one good if any is, and what there is to say."""
-        tries: list[_nlp.Attempt] = []
-        message = ""
+        self, program: Program, state: np.ndarray, guesses: list[np.ndarray]
+    ) -> tuple[list[Attempt], tuple[str, str] | None]:
+        """Return what came of each start, the last one good if any is; status and why if none."""
+        tries: list[Attempt] = []
+        refusal = None
         for guess in guesses:
             value, c = program.values(guess)
             if not (np.isfinite(value) and np.isfinite(c).all()):
-                message = "f, g, path or σ returns NaN or infinity along the plan to start from"
+                why = "f, g, path or σ returns NaN or infinity along the plan to start from"
+                refusal = "failed", why
                 continue
             if (beyond := self._beyond(program, guess)) > 0:
-                wrong = f"x(0) itself is beyond a limit by {beyond:.2g} of its size"
-                return [], f"{infeasible_message(state, self.horizon)}: {wrong}"
-            own, units = own_units(program, guess, self.system.nu)
-
-            def run(z: np.ndarray, own: Any = own, units: Any = units) -> bool:
-                found = _nlp.attempt(own, z, self.solver, self.max_iterations, self.tol)
-                tries.append(dataclasses.replace(found, z=units.whole(found.z)))
-                return found.good(self.tol)
-
-            if run(units.part(guess)):
+                why = f"x(0) itself is beyond a limit by {beyond:.2g} of its size"
+                return [], ("infeasible", f"{infeasible_message(state, self.horizon)}: {why}")
+            found, violation = self._from(program, guess)
+            tries += found
+            if found[-1].good(self.tol):
                 break
-            if tries[-1].feasible and not tries[-1].limited:  # in units of where it stopped
-                own, units = own_units(program, tries[-1].z, self.system.nu)
-                if run(units.part(tries[-1].z), own, units):
-                    break
-            if not tries[-1].feasible:
-                nearer, violation = _nlp.least_violation(own, units.part(tries[-1].z))
-                if not violation <= _nlp.FEASIBLE:
-                    message = (
-                        f"{infeasible_message(state, self.horizon)}: the best plan found breaks "
-                        f"them by {violation:.2g} of their size"
-                    )
-                    continue
-                if run(nearer):
-                    break
-        return tries, message
+            if not violation <= ON_LIMIT:
+                why = f"the best plan found breaks them by {violation:.2g} of their size"
+                refusal = "infeasible", f"{infeasible_message(state, self.horizon)}: {why}"
+        return tries, refusal
 
-    def _beyond(self, program: _nlp.Program, guess: np.ndarray) -> float:
+    def _from(self, program: Program, guess: np.ndarray) -> tuple[list[Attempt], float]:
+        """Return the attempts from one start, and the least violation that was found."""
+        own, units = own_units(program, guess, self.system.nu)
+        tries = [self._attempt(own, units, guess)]
+        if tries[0].feasible and not (tries[0].limited or tries[0].good(self.tol)):
+            guess = tries[0].z  # in units of where it stopped
+            own, units = own_units(program, guess, self.system.nu)
+            tries.append(self._attempt(own, units, guess))
+        if tries[-1].feasible:
+            return tries, 0.0
+        nearer, violation = least_violation(own, units.part(tries[-1].z))
+        if violation <= ON_LIMIT:
+            tries.append(self._attempt(own, units, units.whole(nearer)))
+        return tries, violation
+
+    def _attempt(self, own: Program, units: Units, guess: np.ndarray) -> Attempt:
+        found = attempt(own, units.part(guess), self.max_iterations, self.tol)
+        return dataclasses.replace(found, z=units.whole(found.z))
+
+    def _beyond(self, program: Program, guess: np.ndarray) -> float:
         """Return how far x_0 is beyond limits that no input moves, 0 if it counts as on them."""
         if self._constraints is None:
             return 0.0
@@ -272,88 +276,72 @@ class NonlinearMPC(Controller):
             U = np.asarray(finite_array("start", start))
             if U.shape != (N, nu):
                 raise ValueError(f"start must have shape ({N}, {nu}), got {U.shape}")
-            return [np.clip(U.ravel() / scale, program.lower, program.upper)]
+            return [program.clipped(U.ravel() / scale)]
         rest = np.zeros(nu) if reference is None else reference.u
         plans = [np.tile(rest, (N, 1))]
         if self._plan is not None:
             plans.append(np.concatenate([self._plan[1:], self._plan[-1:]]))
             plans.append(np.concatenate([self._plan[1:], rest[None]]))
-        guesses = [np.clip(U.ravel() / scale, program.lower, program.upper) for U in plans]
+        guesses = [program.clipped(U.ravel() / scale) for U in plans]
+        return promising(program, guesses)[:2]
 
-        return _nlp.promising(program, guesses)[:2]
-
-    def _program(self, layout: Known, flat: Any) -> _nlp.Program:
+    def _program(self, layout: Known, flat: Any) -> Program:
         scale = self._problem.scale
         low, high = (np.tile(b, self.horizon) for b in (self.system.u_min, self.system.u_max))
 
-        @_nlp.remembered
+        @remembered
         def values(z: np.ndarray) -> tuple[float, np.ndarray]:
             f, c = shooting.values(layout, flat, z)
             return float(f), np.asarray(c)
 
-        @_nlp.remembered
+        @remembered
         def slopes(z: np.ndarray) -> shooting.Slopes:
             return shooting.Slopes.of(*shooting.slopes(layout, flat, z))
 
-        @_nlp.remembered
-        def curvature(z: np.ndarray, multipliers: np.ndarray, factor: Any) -> np.ndarray:
-            return np.asarray(shooting.curvature(layout, flat, z, multipliers, factor))
+        @remembered
+        def curvature(z: np.ndarray, multipliers: np.ndarray) -> np.ndarray:
+            return np.asarray(shooting.curvature(layout, flat, z, multipliers))
 
-        def bent(z: np.ndarray, multipliers: np.ndarray, factor: float) -> np.ndarray:
-            return curvature(z, multipliers, np.float64(factor))
-
-        return _nlp.Program(values, slopes, bent, low / scale, high / scale, self._rows)
+        return Program(values, slopes, curvature, low / scale, high / scale, self._rows)
 
     def _solution(
         self,
         packed: tuple[Known, Any],
-        reference: SteadyState | None,
-        tries: list[_nlp.Attempt],
-        message: str,
+        tries: list[Attempt],
+        refusal: tuple[str, str] | None,
         began: float,
     ) -> MPCSolution:
-        N, nu = self.horizon, self.system.nu
-        good = tries[-1] if tries and tries[-1].good(self.tol) else None
-        best = good or min(tries, key=lambda t: (not t.feasible, t.residual), default=None)
-        status, cost = "solved", np.nan
-        U = np.full((N, nu), np.nan)
-        X = np.full((N + 1, self.system.nx), np.nan)
-        if good is not None:
-            message = "a local minimum"
-            z = (good.z * self._problem.scale).reshape(N, nu)
-            U = np.clip(z, self.system.u_min, self.system.u_max)
+        N, system = self.horizon, self.system
+        ranked = sorted(tries, key=lambda t: (not t.good(self.tol), not t.feasible, t.residual))
+        best = ranked[0] if ranked else None
+        status, message = self._said(best, refusal)
+        plan, cost = None, np.nan
+        if best is not None and status == "solved":
+            U = np.clip((best.z * self._problem.scale).reshape(N, -1), system.u_min, system.u_max)
             f, x = shooting.along(*packed, U)
             cost, X = float(f), np.array(x)
-            self._plan = U
+            plan = X, U
             if not (np.isfinite(cost) and np.isfinite(X).all()):  # σ need not see all states
-                status, message, good = "failed", "f returns NaN or infinity along the plan", None
-                U, X, cost = np.full_like(U, np.nan), np.full_like(X, np.nan), np.nan
-        elif best is None:
-            status = "infeasible" if message.startswith("no input") else "failed"
-        elif not best.feasible:
-            status = "infeasible" if message.startswith("no input") else "failed"
-            message = message or (
-                f"the plan breaks the constraints by {best.violation:.2g} of their size"
-            )
-        else:
-            status = "max_iterations" if best.limited else "failed"
-            message = (
-                f"{best.iterations} iterations ended at a plan that is not a minimum: residual "
-                f"{best.residual:.2g}, wanted {self.tol:.2g}"
-            )
-        if good is None:
-            self._plan = None
-        solution = MPCSolution(
-            u=U[0],
-            trajectory=bypass_init(Trajectory, x=X, u=U, y=self.system.output(X[:-1])),
-            cost=cost,
-            status=status,
-            message=message,
-            iterations=sum(t.iterations for t in tries),
-            residual=best.residual if best is not None else np.inf,
-            seconds=time.perf_counter() - began,
+                status, message = "failed", "f returns NaN or infinity along the plan"
+        self._plan = plan[1] if plan is not None and status == "solved" else None
+        residual = np.inf if best is None else best.residual
+        outcome = Outcome(status, message, sum(t.iterations for t in tries), residual)
+        return mpc_solution(system, N, outcome, began, plan, cost)
+
+    def _said(self, best: Attempt | None, refusal: tuple[str, str] | None) -> tuple[str, str]:
+        """Return status and message for the best attempt, None if there was none."""
+        if best is None or not best.feasible:
+            if refusal is None:
+                assert best is not None
+                why = f"the plan breaks the constraints by {best.violation:.2g} of their size"
+                refusal = "failed", why
+            return refusal
+        if best.good(self.tol):
+            return "solved", "a local minimum"
+        return "max_iterations" if best.limited else "failed", (
+            f"{best.iterations} iterations ended at a plan that is not a minimum: residual "
+            f"{best.residual:.2g}, wanted {self.tol:.2g}"
         )
-        return with_reference(solution, reference)
 
 
 def _check_path(path: Callable[[Any, Any], Any], system: System) -> None:

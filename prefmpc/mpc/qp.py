@@ -19,11 +19,12 @@ from prefmpc.mpc._stages import Bounds, StageProgram
 from prefmpc.mpc.solution import (
     Controller,
     MPCSolution,
+    Outcome,
     check_problem,
     check_single_state,
+    explained,
     fixed_message,
     mpc_solution,
-    no_plan,
 )
 from prefmpc.mpc.steady import SteadyState, check_reference, with_reference
 from prefmpc.mpc.terminal import TerminalIngredients, check_polyhedron, terminal_set
@@ -120,24 +121,19 @@ class LinearMPC(Controller):
         if reference is not None:
             check_reference(reference, self.system, self._constraints, self._ingredients)
         if program.fixed.broken(x0):
-            return no_plan(self.system, self.horizon, "infeasible", fixed_message(x0), began)
+            outcome = Outcome("infeasible", fixed_message(x0))
+            return mpc_solution(self.system, self.horizon, outcome, began)
         bounds = program.bounds(x0, reference)
         with self._lock:
             found = self._solved(bounds)
-        plan = found.z * bounds.unit
-        cost = program.objective(plan) if found.status == "solved" else np.nan
+        z = found.z * bounds.unit
+        cost = program.objective(z) if found.status == "solved" else np.nan
         if bounds.origin is not None:
-            plan = plan + bounds.origin
-        states, inputs = program.split(plan)
-        solution = mpc_solution(
-            self.system,
-            x0,
-            (states * program.dx, inputs * program.du),
-            cost,
-            found,
-            began,
-            limited=self._limited,
-        )
+            z = z + bounds.origin
+        states, inputs = program.split(z)
+        plan = states * program.dx, inputs * program.du
+        outcome = explained(found, x0, self.horizon, limited=self._limited)
+        solution = mpc_solution(self.system, self.horizon, outcome, began, plan, cost)
         return with_reference(solution, reference)
 
     def _solved(self, bounds: Bounds) -> ConeSolution:

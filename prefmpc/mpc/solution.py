@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, is_traced, shaped
+from prefmpc._checks import finite_array, instance, is_traced, shaped
 from prefmpc._pytree import bypass_init
 from prefmpc._results import Result
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.preferences.trajectories import Trajectory
-from prefmpc.systems.linear import LinearSystem
+from prefmpc.systems.linear import LinearSystem, System
 
 
 class MPCError(RuntimeError):
@@ -91,10 +91,8 @@ class Controller:
 
 def check_problem(system: Any, cost: Any) -> None:
     """Raise a ValueError unless ``cost`` is a QuadraticCost that fits the LinearSystem."""
-    if not isinstance(system, LinearSystem):
-        raise ValueError(f"system must be a LinearSystem, got {type(system).__name__}")
-    if not isinstance(cost, QuadraticCost):
-        raise ValueError(f"cost must be a QuadraticCost, got {type(cost).__name__}")
+    instance("system", system, LinearSystem)
+    instance("cost", cost, QuadraticCost)
     sizes = (cost.Q.shape[-1], cost.R.shape[-1])
     if sizes != (system.nx, system.nu):
         raise ValueError(
@@ -141,47 +139,25 @@ def check_single_state(x0: ArrayLike, nx: int) -> np.ndarray:
     return state
 
 
-def predicted(system: LinearSystem, states: np.ndarray, inputs: np.ndarray) -> Trajectory:
-    """Return a plan as a trajectory, NaN where the solve failed."""
-    # Built without validation: the values of a failed solve are NaN on purpose.
-    return bypass_init(Trajectory, x=states, u=inputs, y=states[:-1] @ system.C.T)
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How a solve ended, in the words of `MPCSolution`."""
+
+    status: str
+    message: str
+    iterations: int = 0
+    residual: float = 0.0
 
 
-def no_plan(
-    system: LinearSystem, horizon: int, status: str, message: str, began: float
-) -> MPCSolution:
-    """Return the answer where there is nothing to solve."""
-    plan = np.full((horizon + 1, system.nx), np.nan), np.full((horizon, system.nu), np.nan)
-    return MPCSolution(
-        u=plan[1][0],
-        trajectory=predicted(system, *plan),
-        cost=np.nan,
-        status=status,
-        message=message,
-        iterations=0,
-        residual=0.0,
-        seconds=time.perf_counter() - began,
-    )
+def explained(found: Any, x0: np.ndarray, horizon: int, *, limited: bool) -> Outcome:
+    """Return how a convex solve ended, in words that fit the problem.
 
-
-def mpc_solution(
-    system: LinearSystem,
-    x0: np.ndarray,
-    plan: tuple[np.ndarray, np.ndarray],
-    cost: float,
-    found: Any,
-    began: float,
-    *,
-    limited: bool,
-) -> MPCSolution:
-    """Return the answer of a controller: the plan, or NaN and the reason why there is none.
-
-    ``plan`` is the states and inputs; ``found`` has status, message, iterations and residual.
-    ``limited`` says whether there is more to keep to than input bounds.
+    ``found`` has the fields of an `Outcome`. ``limited`` says whether there is more to keep to
+    than input bounds.
     """
-    status, message, (states, inputs) = found.status, found.message, plan
+    status, message = found.status, found.message
     if status == "infeasible" and limited:
-        message = infeasible_message(x0, len(inputs))
+        message = infeasible_message(x0, horizon)
     elif status == "infeasible":
         # A solver's proof rules out the plans of moderate size only.
         status = "failed"
@@ -189,17 +165,27 @@ def mpc_solution(
             "input bounds alone always leave a plan, but here every one leads so far out that "
             "float64 cannot tell the best"
         )
-    if status != "solved":
-        states, inputs = np.full_like(states, np.nan), np.full_like(inputs, np.nan)
+    return Outcome(status, message, found.iterations, found.residual)
+
+
+def mpc_solution(
+    system: System,
+    horizon: int,
+    outcome: Outcome,
+    began: float,
+    plan: tuple[np.ndarray, np.ndarray] | None = None,
+    cost: float = np.nan,
+) -> MPCSolution:
+    """Return the answer of a controller: the plan (states, inputs) if it is solved, else NaN."""
+    if plan is None or outcome.status != "solved":
+        plan = np.full((horizon + 1, system.nx), np.nan), np.full((horizon, system.nu), np.nan)
         cost = np.nan
-    inputs = np.clip(inputs, system.u_min, system.u_max)
+    states, inputs = plan[0], np.clip(plan[1], system.u_min, system.u_max)
     return MPCSolution(
         u=inputs[0],
-        trajectory=predicted(system, states, inputs),
+        # Built without validation: the values of a failed solve are NaN on purpose.
+        trajectory=bypass_init(Trajectory, x=states, u=inputs, y=system.output(states[:-1])),
         cost=cost,
-        status=status,
-        message=message,
-        iterations=found.iterations,
-        residual=found.residual,
         seconds=time.perf_counter() - began,
+        **vars(outcome),
     )

@@ -189,10 +189,10 @@ def _search(
         z = Target(A, B, C, right, wanted - y + C @ x, sizes, rank=SMALL).solve(Z)
         if z is None:
             return None
-        move = np.abs(z - np.concatenate([x, u])) / sizes
+        change = np.abs(z - np.concatenate([x, u])) / sizes
         x, u = z[: x.size], z[x.size :]
         gap = np.abs(np.asarray(system.step(x, u)) - x) / sizes[: x.size]
         size = 1 + np.abs(z / sizes).max()
-        if gap.max() <= EXACT * size and move.max() <= REACHED * size:
+        if gap.max() <= EXACT * size and change.max() <= REACHED * size:
             return _point(system, z, Z)
     return None

@@ -10,7 +10,13 @@ from jax.typing import ArrayLike
 from prefmpc.mpc._target import input_sizes, kept
 from prefmpc.mpc.nonlinear import NonlinearMPC
 from prefmpc.mpc.qp import LinearMPC
-from prefmpc.mpc.solution import Controller, MPCSolution, check_single_state, no_plan
+from prefmpc.mpc.solution import (
+    Controller,
+    MPCSolution,
+    Outcome,
+    check_single_state,
+    mpc_solution,
+)
 from prefmpc.mpc.steady import SteadyState, steady_state
 from prefmpc.systems.linear import LinearSystem
 from prefmpc.systems.sets import Polyhedron
@@ -90,8 +96,7 @@ class ReferenceTracker(Controller):
                     self.reference = self._target(self._y_r, (x, self.reference.u))
                 except ValueError as error:
                     system, N = self.controller.system, self.controller.horizon
-                    assert isinstance(system, LinearSystem)
-                    return no_plan(system, N, "infeasible", str(error), began)
+                    return mpc_solution(system, N, Outcome("infeasible", str(error)), began)
         return self.controller.solve(x0, reference=self.reference)
 
     def applied(self, u: np.ndarray) -> None:
