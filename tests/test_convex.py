@@ -337,3 +337,19 @@ def test_only_a_small_finite_decrement_is_a_minimum(monkeypatch, place, bad):
 def test_bad_input_is_named(call, words):
     with pytest.raises(ValueError, match=words):
         call()
+
+
+@pytest.mark.parametrize("outputs", [None, np.eye(2)])
+def test_set_points_count_in_outputs_and_in_new_pairs(outputs):
+    rng = np.random.default_rng(5)
+    x, u, x_r, u_r = (rng.normal(size=s) for s in ((20, 6, 2), (20, 5, 1), (20, 2), (20, 1)))
+    there = Trajectory(x, u, x_r=x_r, u_r=u_r)
+    pairs, labels = (np.arange(10), np.arange(10, 20)), rng.integers(0, 2, 10).astype(float)
+    asked, plain = (
+        fit_map(Comparisons(T, *pairs, labels), bryson([1, 1], [1]), outputs=outputs)
+        for T in (there, there.deviation())
+    )
+    np.testing.assert_array_equal(asked.Q, plain.Q)
+    means = asked.probability(there[:10], there[10:]).mean
+    z = asked.model(there[10:]) - asked.model(there[:10])
+    assert ((means > 0.5) == (z > 0)).all()
