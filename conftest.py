@@ -29,7 +29,7 @@ os.environ.setdefault(
 _setting = re.sub(r"\W+", "-", "xla " + os.environ["XLA_FLAGS"])
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax" / _setting))
 os.environ.setdefault("JAX_COMPILATION_CACHE_MAX_SIZE", str(500_000_000))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.2")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
 
 
 import jax  # noqa: E402

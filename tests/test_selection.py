@@ -2,32 +2,22 @@
 
 from __future__ import annotations
 
-import jax
 import numpy as np
 import pytest
+from sampled_answers import sampled_answers
 
 from prefmpc import (
     Comparisons,
     FitError,
-    QuadraticCost,
     bryson,
     choose_prior,
     fit_map,
-    logistic,
-    lqr_pool,
-    oscillating_masses,
 )
 from prefmpc.learning import selection
 from studies import RADIUS
 
-POOL = lqr_pool(
-    oscillating_masses(), 30, 10, key=jax.random.key(2200), radius=RADIUS, saturate=False
-)
 TRUE = bryson(RADIUS, [1, 1], scale=3e-3)
-PERSON = logistic(QuadraticCost(TRUE.Q, TRUE.R), 1.0)
-ANSWERS = Comparisons.random(POOL, PERSON, 60, key=jax.random.key(2201)).sampled(
-    key=jax.random.key(2202)
-)
+POOL, ANSWERS = sampled_answers(TRUE, 60, seed=2200)
 PRIORS = [
     bryson(RADIUS, [1, 1], scale=s, strength=a) for s in (3e-5, 3e-3, 0.3) for a in (1.0, 10.0)
 ]

@@ -7,6 +7,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from sampled_answers import sampled_answers
 from scipy.integrate import quad
 from scipy.special import gammaln
 from scipy.stats import gamma, wishart
@@ -14,7 +15,6 @@ from scipy.stats import gamma, wishart
 from prefmpc import (
     Comparisons,
     FitError,
-    QuadraticCost,
     QuadraticPreference,
     Trajectory,
     WishartPrior,
@@ -22,8 +22,6 @@ from prefmpc import (
     bryson,
     choose_prior,
     fit_map,
-    logistic,
-    lqr_pool,
     oscillating_masses,
     posterior,
 )
@@ -31,14 +29,8 @@ from prefmpc.learning._chart import Chart, laplaces
 from prefmpc.learning.uncertainty import Posterior, effective_draws
 from studies import RADIUS
 
-POOL = lqr_pool(
-    oscillating_masses(), 30, 10, key=jax.random.key(2100), radius=RADIUS, saturate=False
-)
 PRIOR = bryson(RADIUS, [1, 1], scale=1e-3)
-PERSON = logistic(QuadraticCost(2 * PRIOR.Q, PRIOR.R), 1.0)
-ANSWERS = Comparisons.random(POOL, PERSON, 40, key=jax.random.key(2101)).sampled(
-    key=jax.random.key(2102)
-)
+POOL, ANSWERS = sampled_answers(WishartPrior(2 * PRIOR.Q, PRIOR.R), 40, seed=2100)
 NOTHING = Comparisons(POOL, [0], [0], [0.5])  # says nothing at all
 COUPLED = WishartPrior(
     3 * np.eye(6) + 0.5 * np.ones((6, 6)), np.array([[2.0, 0.3], [0.3, 1]]), strength=2.5
