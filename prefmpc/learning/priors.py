@@ -1,4 +1,8 @@
-"""What is believed of Q and R before anybody answered, and which of their entries are free."""
+"""What is believed of Q and R before anybody answered, and which of their entries are free.
+
+The learner leans on the form of these priors: they are log-concave in (Q, R), which makes the
+problem convex and its certificate one of the global minimum. Another family is another learner.
+"""
 
 from __future__ import annotations
 

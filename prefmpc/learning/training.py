@@ -1,4 +1,4 @@
-"""Learning σ from comparisons by the paper's recipe, all restarts at once."""
+"""Learning σ from comparisons by the paper's recipe, all restarts in one compiled call."""
 
 from __future__ import annotations
 

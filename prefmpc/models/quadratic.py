@@ -32,6 +32,9 @@ FIRST_MIN = 1.0
 class CostModel(Protocol):
     """What `fit` needs of a σ model: a pytree of weights with four pure functions.
 
+    Register a class of your own with `prefmpc._pytree.register_pytree`, and derive it from `Stack`,
+    so that restarts can be stacked. `NonlinearMPC` takes any.
+
     ``linear_in_features`` promises score(a) − score(b) = score(a − b): then a pair of
     trajectories enters the loss as one difference of features.
     """

@@ -18,8 +18,13 @@ from prefmpc._random import generator
 from prefmpc.preferences.people import Preference, asked
 from prefmpc.preferences.trajectories import Trajectory, check_finite
 
-_FORMAT_VERSIONS = (1, 2)  # (x, u, y) alone, and with what is optional
-_OPTIONAL = ("x_r", "u_r", "y_r", "u_before")
+_OPTIONAL = dict.fromkeys(("x_r", "u_r", "y_r", "u_before"), 2)
+"""What a trajectory may have beside x, u and y, and the version of the format that brought it.
+
+A file has the least version that holds all that is in it: who reads older ones refuses it instead
+of losing a part.
+"""
+_FORMAT_VERSIONS = tuple(range(1, 1 + max(_OPTIONAL.values())))
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
@@ -115,7 +120,7 @@ class Comparisons:
     def sampled(self, *, key: Any) -> Comparisons:
         """Draw an answer 0 or 1 for every pair, 1 with the probability that its label gives."""
         answers = generator(key).uniform(size=len(self)) < self.labels
-        return Comparisons(self.trajectories, self.first, self.second, answers.astype(float))
+        return self._with(labels=answers.astype(float))
 
     @classmethod
     def from_arrays(
@@ -165,9 +170,12 @@ class Comparisons:
             fits = chosen.ndim == 1 and chosen.size > 0 and bool(inside.all())
         if not fits:
             raise ValueError(f"index must choose among the {n} comparisons, got {chosen}")
-        return Comparisons(
-            self.trajectories, self.first[chosen], self.second[chosen], self.labels[chosen]
-        )
+        pairs = {"first": self.first, "second": self.second, "labels": self.labels}
+        return self._with(**{name: value[chosen] for name, value in pairs.items()})
+
+    def _with(self, **changed: Any) -> Comparisons:
+        """Return a copy in which some fields are others."""
+        return Comparisons(**{**vars(self), **changed})
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Write everything to one ``.npz`` file; an interrupted write leaves an old file whole.
@@ -199,7 +207,7 @@ class Comparisons:
         optional = {name: value for name, value in optional.items() if value is not None}
         pairs = {"first": self.first, "second": self.second, "labels": self.labels}
         # A reader that does not know set points must refuse them, not lose them.
-        version = _FORMAT_VERSIONS[bool(optional)]
+        version = max((_OPTIONAL[name] for name in optional), default=1)
         stored = {"format_version": version, **arrays, **optional, **pairs}
         return {name: np.asarray(value) for name, value in stored.items()}
 

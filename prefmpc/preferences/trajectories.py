@@ -1,4 +1,4 @@
-"""Trajectories T = (X, U, Y): the container, the quadratic cost φ, rollouts and random pools."""
+"""Trajectories T = (X, U, Y): the container, the quadratic cost φ, rollouts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Constraint sets: polyhedra and ellipsoids."""
+"""Constraint sets: polyhedra, ellipsoids and cones.
+
+A set with finitely many faces is a constructor of `Polyhedron`, like `Polyhedron.box`.
+"""
 
 from __future__ import annotations
 
