@@ -5,6 +5,7 @@ choices, through P(T_i is preferred to T_j) = 1 / (1 + exp(σ(T_i) − σ(T_j)))
 objective of the controller.
 """
 
+from prefmpc.asking import Interview, Question
 from prefmpc.evaluation import WinRate, accuracy, regret, simulate, win_rate
 from prefmpc.learning import (
     FitError,
@@ -104,6 +105,7 @@ __all__ = [
     "GlobalResult",
     "ICNNCost",
     "Interval",
+    "Interview",
     "LinearMPC",
     "LinearSystem",
     "MLPCost",
@@ -120,6 +122,7 @@ __all__ = [
     "PriorChoice",
     "QuadraticCost",
     "QuadraticPreference",
+    "Question",
     "ReferenceTracker",
     "SecondOrderCone",
     "SeparableCost",

@@ -113,6 +113,7 @@ ROOMS = {
     "models": {"systems", "preferences"},
     "learning": {"preferences", "models"},
     "mpc": {"systems", "preferences", "models"},
+    "asking": {"systems", "preferences", "models", "learning", "mpc"},
     "evaluation": {"systems", "preferences", "models", "mpc"},
     "plots": set(),
 }
