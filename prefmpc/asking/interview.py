@@ -45,7 +45,7 @@ class Interview:
         A `LinearSystem`, or any with a ``controller`` of your own.
     prior : WishartPrior or SeparableCost, optional
         Its mode (its weights) is the centre of what is believed: log weights are Gaussian about
-        it. Default: Bryson's rule with the largest x(0) and the input limits.
+        it. Default: Bryson's rule with what responses from x(0) reach, and the input limits.
     x0 : array (nx,), array (m, nx), or function
         Half-widths of a box, a list of states, or (generator, n) ↦ (n, nx).
     key : JAX key or int
@@ -207,17 +207,21 @@ class Interview:
 
     @property
     def model(self) -> CostModel:
-        """The σ to use now: the most probable log weights."""
-        return self._belief.features.model(self._state(len(self)).laplace.eta)
+        """The σ to use now: the mean over the posterior of the weights at equal sharpness.
+
+        It minimises what is expected of the person's own cost, in units in which all that they
+        may want counts alike.
+        """
+        return self._belief.features.model(self._state(len(self)).mean)
 
     @property
     def posterior(self) -> CostModel:
         """Equally probable σ after the answers, a stack."""
-        return self._belief.features.model(self._state(len(self)).eta)
+        return self._belief.features.model(self._state(len(self)).w)
 
     @property
     def certificate(self) -> Laplace:
-        """The numbers that say that `model` is a local maximum of the posterior density."""
+        """The numbers that say that a local maximum of the posterior density was found."""
         return self._state(len(self)).laplace
 
     @property
@@ -241,7 +245,7 @@ class Interview:
         n = len(self)
         return self._once(
             ("regret", n, 0),
-            lambda: regret_of(self._state(n).laplace.eta, self._state(n).eta, self._options),
+            lambda: regret_of(self._state(n).mean, self._state(n).w, self._options),
         )
 
     @property

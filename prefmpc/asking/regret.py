@@ -65,19 +65,18 @@ class Consistency:
     first: float
 
 
-def regret_of(eta: np.ndarray, samples: np.ndarray, options: Options) -> Regret:
-    """Return the regret of the controller of η (p,) over samples (S, p) of the posterior.
+def regret_of(present: np.ndarray, samples: np.ndarray, options: Options) -> Regret:
+    """Return the regret of the controller of weights w (p,) over samples (S, p) of the posterior.
 
     The x(0) are a function of the key alone, and the same for all.
     """
     features, samples = options.features, samples[:JUDGED]
     x0 = options.states.draw(FROM, options.rng(0, 2))
-    runs = options.loops(features.model(np.concatenate([eta[None], samples])), x0)
+    runs = options.loops(features.model(np.concatenate([present[None], samples])), x0)
     phi = np.asarray(features(runs))  # (1 + S, m, p)
     finite = np.isfinite(phi).all(axis=(0, 2))
     if not finite.any():
         raise ValueError("x0 must hold a state from which every controller reaches the end")
-    mean = phi[:, finite].mean(axis=1)
-    w = features.chart.weights(samples)
-    costs = w @ mean.T  # (S, 1 + S): saturated, a sample's own LQR need not be the best for it
+    # Saturated, a sample's own LQR need not be the best for it.
+    costs = samples @ phi[:, finite].mean(axis=1).T
     return Regret(costs[:, 0] / costs.min(axis=1) - 1)
