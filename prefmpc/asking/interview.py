@@ -310,12 +310,20 @@ class Interview:
         lines, size = read(path)
         interview = cls(**Options.arguments(lines[0], functions))
         answers = interview._answers
-        for line in lines[1:]:
-            if "undo" in line:
-                interview._batch = answers.pop().batch
-            else:
-                answers.append(_from_line(line))
-                interview._batch = answers[-1].batch
+        for place, line in enumerate(lines[1:], 2):
+            try:
+                if "undo" in line:
+                    answer = answers.pop()
+                    fits = len(answers) == line["undo"]
+                else:
+                    answer = _from_line(line)
+                    fits = len(answers) == line["number"]
+                    answers.append(answer)
+            except (KeyError, IndexError, TypeError, ValueError):
+                fits = False
+            if not fits:
+                raise ValueError(f"path must be a log, {path} makes no sense in line {place}")
+            interview._batch = answer.batch
         if append:
             interview._log = Log(path, size)
         return interview

@@ -20,6 +20,10 @@ Loops = Callable[[Any, np.ndarray], Trajectory]
 
 Controller = Literal["lqr", "mpc"] | Loops
 
+CONTROLLERS = 12
+STATES = 12
+"""So many samples of the posterior and so many x(0) make the closed loops of one question."""
+
 DOUBLINGS = 60
 
 
@@ -84,10 +88,14 @@ def loops_of(
         return lambda models, x0: lqr_loops(system, models, x0, steps)
 
     def mpc(models: QuadraticCost, x0: np.ndarray) -> Trajectory:
-        runs = closed_loops(
-            system, models, x0, horizon=horizon, steps=steps, constraints=constraints
-        )
-        return runs.trajectories
+        count, parts = models.batch_shape[0], []
+        for begin in range(0, count, CONTROLLERS):  # of one size, so that it compiles once
+            part = models[np.minimum(np.arange(begin, begin + CONTROLLERS), count - 1)]
+            runs = closed_loops(
+                system, part, x0, horizon=horizon, steps=steps, constraints=constraints
+            )
+            parts.append(runs.trajectories)
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
 
     return mpc
 

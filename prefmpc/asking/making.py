@@ -9,6 +9,7 @@ import numpy as np
 from prefmpc._checks import real_array
 from prefmpc.asking.belief import Belief, Laplace
 from prefmpc.asking.criteria import CRITERIA
+from prefmpc.asking.loops import CONTROLLERS, STATES
 from prefmpc.asking.options import Options
 from prefmpc.asking.questions import (
     Candidates,
@@ -18,14 +19,7 @@ from prefmpc.asking.questions import (
     probability,
     stacked,
 )
-from prefmpc.asking.sources import (
-    CONTROLLERS,
-    STATES,
-    Shown,
-    check_pool,
-    loops_shown,
-    pool_shown,
-)
+from prefmpc.asking.sources import Shown, check_pool, loops_shown, pool_shown
 from prefmpc.preferences.trajectories import Trajectory
 
 RECENT = 4

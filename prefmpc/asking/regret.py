@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 
 from prefmpc._checks import nonnegative, share
+from prefmpc.asking.loops import STATES
 from prefmpc.asking.options import Options
 
 JUDGED = 100
-"""So many samples of the posterior say what the regret may be, from so many x(0):"""
-FROM = 16
+"""So many samples of the posterior say what the regret may be."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -71,12 +71,12 @@ def regret_of(present: np.ndarray, samples: np.ndarray, options: Options) -> Reg
     The x(0) are a function of the key alone, and the same for all.
     """
     features, samples = options.features, samples[:JUDGED]
-    x0 = options.states.draw(FROM, options.rng(0, 2))
+    x0 = options.states.draw(STATES, options.rng(0, 2))
     runs = options.loops(features.model(np.concatenate([present[None], samples])), x0)
     phi = np.asarray(features(runs))  # (1 + S, m, p)
-    finite = np.isfinite(phi).all(axis=(0, 2))
-    if not finite.any():
-        raise ValueError("x0 must hold a state from which every controller reaches the end")
-    # Saturated, a sample's own LQR need not be the best for it.
-    costs = samples @ phi[:, finite].mean(axis=1).T
-    return Regret(costs[:, 0] / costs.min(axis=1) - 1)
+    reached = np.isfinite(phi[0]).all(axis=-1)
+    if not reached.any():
+        raise ValueError("x0 must hold a state from which the present controller reaches the end")
+    costs = samples @ phi[:, reached].mean(axis=1).T
+    # Saturated, a sample's own LQR need not be the best for it; who fails is not.
+    return Regret(costs[:, 0] / np.nanmin(costs, axis=1) - 1)

@@ -15,10 +15,6 @@ from prefmpc.preferences.pools import random_states
 from prefmpc.preferences.trajectories import Trajectory, failed
 from prefmpc.systems.sets import Polyhedron
 
-STATES = 12
-CONTROLLERS = 12
-"""So many x(0) and so many samples of the posterior make the closed loops of one question."""
-
 MOST_PAIRS = 4000
 
 
