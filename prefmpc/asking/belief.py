@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import expit
 
 from prefmpc.asking.features import FeatureMap
+from prefmpc.asking.likelihood import lapsing
 
 LAPSE_CENTRE = np.log(0.04 / 0.96)
 LAPSE_SPREAD = 1.0
@@ -203,7 +205,7 @@ class Belief:
                 loss = np.maximum(z, 0) + np.log1p(np.exp(-np.abs(z))) - labels * z
             else:
                 rate = self._rate(at)[:, None] if lapse is None else lapse
-                loss = _lapsing(z, labels, rate)[0]
+                loss = lapsing(z, labels, rate)[0]
             total = 0.5 * (at**2).sum(-1) + loss.sum(-1)
         return np.where(np.isfinite(total), total, np.inf)
 
@@ -219,7 +221,7 @@ class Belief:
             slope, curvature = s - labels, s * (1 - s)
         else:
             rate = self._rate(at) if lapse is None else lapse
-            _, slope, curvature, by_rate = _lapsing(z, labels, rate)
+            _, slope, curvature, by_rate = lapsing(z, labels, rate)
         to_at = gap @ (jacobian @ self._basis)
         gradient, hessian = at.copy(), np.eye(len(at))
         gradient[:n] += to_at.T @ slope
@@ -280,7 +282,9 @@ class _Minimum(NamedTuple):
     curvature: float
 
 
-def _slice(x, level, excess, rng):  # type: ignore[no-untyped-def]
+def _slice(
+    x: np.ndarray, level: np.ndarray, excess: Callable[..., np.ndarray], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Move every chain (m, q) once: Murray, Adams and MacKay's elliptical slice sampling."""
     count = len(x)
     other = rng.standard_normal(x.shape)
@@ -303,18 +307,3 @@ def _slice(x, level, excess, rng):  # type: ignore[no-untyped-def]
         high[open_] = np.where(below, high[open_], angle[open_])
         angle[open_] = rng.uniform(low[open_], high[open_])
     return new, value
-
-
-def _lapsing(z, labels, rate):  # type: ignore[no-untyped-def]
-    """Return the loss, its two derivatives by z, and those by the rate: ∂ε, ∂ε∂z and ∂ε²."""
-    s = expit(z)
-    p = rate / 2 + (1 - rate) * s
-    q = rate / 2 + (1 - rate) * (1 - s)
-    loss = -labels * np.log(p) - (1 - labels) * np.log(q)
-    by_p = (1 - labels) / q - labels / p
-    by_pp = labels / p**2 + (1 - labels) / q**2
-    ds = s * (1 - s)
-    p_z, p_zz, p_e, p_ez = (1 - rate) * ds, (1 - rate) * ds * (1 - 2 * s), 0.5 - s, -ds
-    curvature = by_pp * p_z**2 + by_p * p_zz
-    by_rate = by_p * p_e, by_pp * p_e * p_z + by_p * p_ez, by_pp * p_e**2
-    return loss, by_p * p_z, curvature, by_rate

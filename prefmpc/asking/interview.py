@@ -9,16 +9,17 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from prefmpc._checks import function, number, positive_int
+from prefmpc._checks import function, nonnegative, positive_int
 from prefmpc._files import atomic_write
+from prefmpc.asking.answers import Answer, label_of, line_of, replayed
 from prefmpc.asking.belief import Laplace
 from prefmpc.asking.criteria import Criterion
-from prefmpc.asking.log import Log, encoded, read, trajectory_from
+from prefmpc.asking.log import Log, encoded, read
 from prefmpc.asking.loops import Controller
-from prefmpc.asking.making import Answer, State, make, state_after
+from prefmpc.asking.making import State, make, state_after
 from prefmpc.asking.options import Options
 from prefmpc.asking.questions import Question, stacked
-from prefmpc.asking.regret import Consistency, Regret, regret_of
+from prefmpc.asking.regret import Consistency, Regret, consistency_of, regret_of
 from prefmpc.asking.sources import Pool
 from prefmpc.learning.convex import MapResult, fit_map
 from prefmpc.learning.priors import WishartPrior
@@ -150,10 +151,10 @@ class Interview:
         ValueError
             If it is none of these.
         """
-        label = _label(value)
+        label = label_of(value)
         answer = Answer(self.next(), label, self._batch)
         if self._log is not None:
-            self._log.append(_line(len(self), answer))
+            self._log.append(line_of(len(self), answer))
         self._answers.append(answer)
 
     def answer_with(self, preference: Preference, count: int) -> None:
@@ -251,18 +252,7 @@ class Interview:
     @property
     def consistency(self) -> Consistency:
         """What the repeated questions say of the person."""
-        labels = self.labels
-        pairs = [
-            (labels[i], 1 - labels[q.repeats])
-            for i, q in enumerate(self.questions)
-            if q.repeats is not None and not np.isnan(labels[[i, q.repeats]]).any()
-        ]
-        known = labels[~np.isnan(labels)]
-        return Consistency(
-            repeats=len(pairs),
-            equal=float(np.mean([1 - abs(a - b) for a, b in pairs])) if pairs else np.nan,
-            first=float(known.mean()) if known.size else np.nan,
-        )
+        return consistency_of(self.questions, self.labels)
 
     def finished(self, level: float = 0.02, q: float = 0.9, least_gain: float = 0.0) -> str | None:
         """Return why to stop asking, None if there is reason to go on.
@@ -274,6 +264,7 @@ class Interview:
         least_gain : float
             What an answer costs, in nats: stop if the next question is worth less.
         """
+        least_gain = nonnegative("least_gain", least_gain, allow_inf=True)
         if self.regret.stop(level, q):
             return f"the regret is at most {100 * level:g} % with probability {q:g}"
         if self.next().gain < least_gain:
@@ -284,10 +275,12 @@ class Interview:
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write the whole interview as a log, which `load` resumes."""
+        if not isinstance(path, str | os.PathLike):
+            raise ValueError(f"path must be a path, got {type(path).__name__}")
         with atomic_write(path, overwrite=overwrite) as file:
             file.write(encoded(self._options.stored()))
             for number, answer in enumerate(self._answers):
-                file.write(encoded(_line(number, answer)))
+                file.write(encoded(line_of(number, answer)))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], *, append: bool = True, **functions: Any) -> Self:
@@ -309,21 +302,7 @@ class Interview:
         """
         lines, size = read(path)
         interview = cls(**Options.arguments(lines[0], functions))
-        answers = interview._answers
-        for place, line in enumerate(lines[1:], 2):
-            try:
-                if "undo" in line:
-                    answer = answers.pop()
-                    fits = len(answers) == line["undo"]
-                else:
-                    answer = _from_line(line)
-                    fits = len(answers) == line["number"]
-                    answers.append(answer)
-            except (KeyError, IndexError, TypeError, ValueError):
-                fits = False
-            if not fits:
-                raise ValueError(f"path must be a log, {path} makes no sense in line {place}")
-            interview._batch = answer.batch
+        interview._answers, interview._batch = replayed(lines[1:], path)
         if append:
             interview._log = Log(path, size)
         return interview
@@ -360,37 +339,3 @@ class Interview:
             self._cache = {k: v for k, v in self._cache.items() if k[1] in kept}
             self._cache[name] = value
         return self._cache[name]
-
-
-def _label(value: Any) -> float:
-    if value is None or (isinstance(value, str) and value == "skip"):
-        return float("nan")
-    if isinstance(value, str):
-        if value in ("first", "second"):
-            return float(value == "first")
-    else:
-        p = number("value", value)
-        if 0 <= p <= 1:
-            return p
-    raise ValueError(
-        f'value must be "first", "second", "skip", None or a probability in [0, 1], got {value!r}'
-    )
-
-
-def _line(count: int, answer: Answer) -> dict[str, Any]:
-    """Return the line of a log for the answer to a question."""
-    label = None if np.isnan(answer.label) else answer.label
-    return {
-        "answer": label,
-        "number": count,
-        "batch": answer.batch,
-        "question": vars(answer.question),
-    }
-
-
-def _from_line(line: dict[str, Any]) -> Answer:
-    stored = line["question"]
-    sides = {side: trajectory_from(stored[side]) for side in ("first", "second")}
-    label = float("nan") if line["answer"] is None else float(line["answer"])
-    start, size = line["batch"]
-    return Answer(Question(**{**stored, **sides}), label, (start, size))

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from prefmpc._checks import real_array
+from prefmpc.asking.answers import Answer
 from prefmpc.asking.belief import Belief, Laplace
 from prefmpc.asking.criteria import CRITERIA
 from prefmpc.asking.loops import CONTROLLERS, STATES
@@ -24,16 +25,6 @@ from prefmpc.preferences.trajectories import Trajectory
 
 RECENT = 4
 """A question is repeated when at least so many others came in between."""
-
-
-class Answer(NamedTuple):
-    """A question and its answer."""
-
-    question: Question
-    label: float
-    """P(first preferred), NaN for a skipped question."""
-    batch: tuple[int, int]
-    """How many answers there were when its batch was made, and the size of the batch."""
 
 
 class State(NamedTuple):

@@ -69,7 +69,7 @@ class Options:
         self.coupling = positive("coupling", self.coupling)
         for name in ("steps", "horizon", "samples"):
             setattr(self, name, positive_int(name, getattr(self, name)))
-        if self.repeat_every != 0:
+        if not (is_whole(self.repeat_every) and self.repeat_every == 0):
             self.repeat_every = positive_int("repeat_every", self.repeat_every)
         if isinstance(self.lapse, str):
             choice("lapse", self.lapse, ("estimate",))

@@ -9,6 +9,7 @@ import numpy as np
 from prefmpc._checks import nonnegative, share
 from prefmpc.asking.loops import STATES
 from prefmpc.asking.options import Options
+from prefmpc.asking.questions import Question
 
 JUDGED = 100
 """So many samples of the posterior say what the regret may be."""
@@ -80,3 +81,15 @@ def regret_of(present: np.ndarray, samples: np.ndarray, options: Options) -> Reg
     costs = samples @ phi[:, reached].mean(axis=1).T
     # Saturated, a sample's own LQR need not be the best for it; who fails is not.
     return Regret(costs[:, 0] / np.nanmin(costs, axis=1) - 1)
+
+
+def consistency_of(questions: list[Question], labels: np.ndarray) -> Consistency:
+    """Return what the repeated questions say; labels (n,) with NaN for skipped ones."""
+    pairs = [(labels[i], 1 - labels[q.repeats]) for i, q in enumerate(questions) if q.repeated]
+    pairs = [pair for pair in pairs if not np.isnan(pair).any()]
+    known = labels[~np.isnan(labels)]
+    return Consistency(
+        repeats=len(pairs),
+        equal=float(np.mean([1 - abs(a - b) for a, b in pairs])) if pairs else np.nan,
+        first=float(known.mean()) if known.size else np.nan,
+    )
