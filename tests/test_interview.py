@@ -283,11 +283,12 @@ BAD = {
 }
 
 
+@pytest.mark.parametrize("make", [Interview])
 @pytest.mark.parametrize(("given", "said"), BAD.values(), ids=BAD)
-def test_bad_input_to_an_interview_is_named(given, said):
+def test_bad_input_to_an_interview_is_named(make, given, said):
     options = {"system": CART, "prior": PRIOR, "x0": [1.0, 0.5], "key": 0, **given}
     with pytest.raises(ValueError, match=said):
-        Interview(**options)
+        make(**options)
 
 
 @pytest.mark.parametrize("value", ["left", 1.5, -0.1, np.nan, [1, 0], object()])
