@@ -129,6 +129,12 @@ def test_gains_are_those_of_riccati_s_equation_also_for_unstable_plants():
     np.testing.assert_allclose(gains(system, Q, R), wanted, rtol=1e-7)
 
 
+def test_weights_that_cannot_control_the_system_are_named():
+    Q, R = np.zeros((1, 2, 2)), np.ones((1, 1, 1))
+    with pytest.raises(ValueError, match="system cannot be controlled with weights that"):
+        gains(CART, Q, R)
+
+
 # What is asked
 
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from test_interview import CART, PERSON, PRIOR, cart, same
 
-from prefmpc import Interview
+from prefmpc import Interview, LinearSystem, Polyhedron, lqr_pool
 
 
 def answered(interview, count=10):
@@ -131,6 +131,19 @@ def test_a_write_that_fails_leaves_the_log_whole(tmp_path, monkeypatch):
     assert same(interview.next(), question)
     interview.answer("first")
     alike(Interview.load(tmp_path / "log"), interview)
+
+
+def test_open_limits_constraints_and_pools_are_stored(tmp_path):
+    pool = lqr_pool(CART, 6, 5, key=jax.random.key(0), radius=[1.0, 0.5])
+    free = LinearSystem(CART.A, CART.B, dt=0.1, u_max=[2.0])
+    limits = Polyhedron.box([-3, -3, -1], [3, 3, np.inf])
+    options = {"pool": pool, "constraints": limits, "controller": "mpc", "lapse": "estimate"}
+    interview = Interview(free, PRIOR, key=0, log=tmp_path / "log", **options)
+    interview.answer_with(PERSON, 2)
+    resumed = Interview.load(tmp_path / "log")
+    alike(resumed, interview)
+    assert resumed._options.system.u_min[0] == -np.inf
+    np.testing.assert_array_equal(resumed._options.constraints.h, limits.h)
 
 
 def test_functions_are_given_again(tmp_path):

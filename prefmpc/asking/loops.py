@@ -67,7 +67,12 @@ def gains(system: LinearSystem, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
         K = np.linalg.solve(R + B.T @ P @ B, B.T @ PA)
         miss = np.abs(Q + A.T @ P @ (A - B @ K) - P).max((-2, -1)) / np.abs(P).max((-2, -1))
     for i in np.flatnonzero(~(miss < RICCATI)):
-        K[i] = system.lqr(Q[i], R[i])[0]
+        try:
+            K[i] = system.lqr(Q[i], R[i])[0]
+        except ValueError as error:
+            raise ValueError(
+                f"system cannot be controlled with weights that the answers leave possible: {error}"
+            ) from None
     return K
 
 

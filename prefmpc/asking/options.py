@@ -73,8 +73,10 @@ class Options:
             self.repeat_every = positive_int("repeat_every", self.repeat_every)
         if isinstance(self.lapse, str):
             choice("lapse", self.lapse, ("estimate",))
-        elif not nonnegative("lapse", self.lapse) < 1:
-            raise ValueError(f'lapse must lie in [0, 1) or be "estimate", got {self.lapse}')
+        else:
+            self.lapse = nonnegative("lapse", self.lapse)
+            if self.lapse >= 1:
+                raise ValueError(f'lapse must lie in [0, 1) or be "estimate", got {self.lapse}')
         self._check_sources()
         if self.prior is None:
             self.prior = self._default_prior()
