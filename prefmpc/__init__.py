@@ -7,6 +7,7 @@ objective of the controller.
 
 from inspect import ismodule as _ismodule
 
+from prefmpc.asking import *
 from prefmpc.evaluation import *
 from prefmpc.learning import *
 from prefmpc.models import *

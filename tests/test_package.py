@@ -19,7 +19,7 @@ import pytest
 
 import prefmpc
 
-LINES, CODE = 12_500, 8_250
+LINES, CODE = 14_500, 9_500
 """The library has at most so many lines, and so many without docstrings, comments and blanks."""
 
 FILE, FUNCTION, HOUR = 350, 60, 3_500
@@ -120,6 +120,7 @@ ROOMS = {
     "models": {"systems", "preferences"},
     "learning": {"preferences", "models"},
     "mpc": {"systems", "preferences", "models"},
+    "asking": {"systems", "preferences", "models", "learning", "mpc"},
     "evaluation": {"systems", "preferences", "models", "mpc"},
     "plots": set(),
 }
@@ -280,6 +281,7 @@ MADE = {
         "NetworkFit",
         "Posterior",
         "PriorChoice",
+        "Question",
         "StabilityCheck",
         "SteadyState",
         "TerminalIngredients",
