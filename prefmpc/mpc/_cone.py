@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import threading
 from collections.abc import Sequence
 from typing import Any
 
@@ -12,6 +11,7 @@ import scipy.sparse as sp
 
 from prefmpc._units import power_of_two
 from prefmpc.mpc._refine import Refiner
+from prefmpc.mpc._turns import Turns
 
 # Clarabel calls a point "almost solved" when it gets no further than the reduced tolerances. It
 # has no say in what counts as solved here: that is the residual below.
@@ -65,7 +65,7 @@ class ConeSolution:
     unit: float = 1.0
 
 
-class ConeProgram:
+class ConeProgram(Turns):
     """min ½ zᵀPz + qᵀz subject to b − A z in a product of cones; only b changes between solves.
 
     Set up once: a new b keeps ordering and symbolic factorisation. Every problem is solved in the
@@ -99,16 +99,7 @@ class ConeProgram:
         flat = all(kind in ("zero", "nonnegative") for kind, _ in self._cones)
         self._refine = Refiner(self._P, self._A) if flat else None
         self._mixed = bool(self._P.count_nonzero() and self._q.any())
-        self._solver: Any = None
-        self._lock = threading.Lock()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out the solver, which is set up again when it is needed."""
-        return {k: v for k, v in self.__dict__.items() if k not in ("_solver", "_lock")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take over what was pickled or copied."""
-        self.__dict__.update(state, _solver=None, _lock=threading.Lock())
+        super().__init__()
 
     def _parts(self) -> list[tuple[str, slice]]:
         """Return the kind of every cone and its rows."""

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from prefmpc._checks import instance, nonnegative, sequence
+from prefmpc._checks import instance, nonnegative, sequence, single
 from prefmpc.models.networks import ICNNCost
 from prefmpc.models.quadratic import QuadraticCost, SumCost
-from prefmpc.mpc.solution import check_dimension
+from prefmpc.mpc._limits import per_unit
+from prefmpc.mpc.solution import check_dimension, check_weights
 from prefmpc.mpc.terminal import stage_constraints
 from prefmpc.systems.linear import LinearSystem
 from prefmpc.systems.sets import Polyhedron, SecondOrderCone
@@ -18,20 +19,13 @@ from prefmpc.systems.sets import Polyhedron, SecondOrderCone
 
 def check_convex(cost: Any, nx: int, nu: int, horizon: int) -> None:
     """Raise a ValueError unless ``cost`` is a convex model that fits nx states and nu inputs."""
-    if getattr(cost, "batch_shape", ()):
-        raise ValueError(f"cost must be a single model, got a stack of shape {cost.batch_shape}")
+    single("cost", cost)
     if isinstance(cost, SumCost):
         for model in cost.models:
             check_convex(model, nx, nu, horizon)
         return
     if isinstance(cost, QuadraticCost):
-        shapes = np.shape(cost.Q), np.shape(cost.R)
-        if shapes != ((nx, nx), (nu, nu)):
-            raise ValueError(
-                f"cost must weigh {nx} states and {nu} inputs, got Q {shapes[0]} and R {shapes[1]}"
-            )
-        if not all(np.isfinite(weights).all() for weights in (cost.theta_Q, cost.theta_R)):
-            raise ValueError("cost must have finite weights, got NaN or infinite ones")
+        check_weights(cost, nx, nu)
         return
     if not isinstance(cost, ICNNCost):
         raise ValueError(
@@ -153,13 +147,6 @@ def check_cones(system: LinearSystem, output_cones: Sequence[SecondOrderCone]) -
     for i, cone in enumerate(sequence("output_cones", output_cones)):
         instance(f"output_cones[{i}]", cone, SecondOrderCone)
         check_dimension(f"output_cones[{i}]", cone.dim, system.ny)
-
-
-def per_unit(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the same rows H z ≤ h with a largest entry of 1 each."""
-    sizes = np.abs(H).max(axis=1, initial=0.0)
-    sizes = np.where(sizes > 0, sizes, 1.0)
-    return H / sizes[:, None], h / sizes
 
 
 def factor(matrix: np.ndarray) -> np.ndarray:

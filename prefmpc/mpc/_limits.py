@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from prefmpc._checks import array_module
 
 ON_LIMIT = 1e-6
@@ -27,6 +29,13 @@ def unmoved(A: Any, B: Any, Hx: Any, Hu: Any, stages: int) -> Any:
         out.append(blind)
         row, size = row @ A, size @ xp.abs(A)
     return xp.stack(out + [blind] * (stages - len(out)))
+
+
+def per_unit(H: np.ndarray, h: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the same rows H z ≤ h with a largest entry of 1 each."""
+    sizes = np.abs(H).max(axis=1, initial=0.0)
+    sizes = np.where(sizes > 0, sizes, 1.0)
+    return H / sizes[:, None], h / sizes
 
 
 def row_sizes(A: Any, B: Any, u_size: Any, x0: Any, Hx: Any, h: Any) -> Any:

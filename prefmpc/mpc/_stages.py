@@ -9,8 +9,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from prefmpc._units import cost_units, free_response, matters, power_of_two
-from prefmpc.mpc._expressions import per_unit
 from prefmpc.mpc._fixed import FixedRows
+from prefmpc.mpc._limits import per_unit
 from prefmpc.mpc.steady import SteadyState
 from prefmpc.systems.linear import LinearSystem
 from prefmpc.systems.sets import Polyhedron

@@ -9,6 +9,7 @@ import numpy as np
 
 from prefmpc._units import completed_units
 from prefmpc.mpc._cone import TIGHT, ConeProgram
+from prefmpc.mpc._limits import per_unit
 from prefmpc.systems.sets import Polyhedron
 
 EXACT = 1e-12
@@ -56,10 +57,7 @@ class Target:
         best = z + free @ near
         if Z is None:
             return best * sizes
-        H = Z.H * sizes
-        reaches = np.abs(H).max(axis=1, initial=0.0)
-        reaches = np.where(reaches > 0, reaches, 1.0)
-        H, h = H / reaches[:, None], Z.h / reaches
+        H, h = per_unit(Z.H * sizes, Z.h)
         if (H @ best <= h + EXACT * np.maximum(np.abs(h), np.abs(H) @ np.abs(best))).all():
             return best * sizes
         w = _within(reach, near, rest, H @ free, h - H @ z)

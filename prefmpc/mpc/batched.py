@@ -97,24 +97,18 @@ def controllers(
             f"got {cost.batch_shape[0]}"
         )
     stacked = bool(system.batch_shape or cost.batch_shape)
-    given = sets(system, constraints, terminal)
-    return Controllers(leading_axis(system), leading_axis(cost), given, stacked)
-
-
-def sets(
-    system: LinearSystem, constraints: Polyhedron | None, terminal: Terminal | None
-) -> Sets | None:
-    """Return the polyhedra beside the input bounds, None if there is nothing."""
-    stage = stage_limit = last = last_limit = None
-    if constraints is None and terminal is None:
-        return None
-    if constraints is not None:
-        check_polyhedron("constraints", constraints, system.nx + system.nu)
-        stage, stage_limit = constraints.H, constraints.h
+    check_polyhedron("constraints", constraints, system.nx + system.nu)
     P, end = terminal_set(terminal, system.nx)
-    if isinstance(end, Polyhedron):
-        last, last_limit = end.H, end.h
-    return Sets(stage, stage_limit, last, last_limit, P)
+    stage, last = (
+        (part.H, part.h) if isinstance(part, Polyhedron) else (None, None)
+        for part in (constraints, end)
+    )
+    given = (
+        None
+        if constraints is None and terminal is None
+        else Sets(stage[0], stage[1], last[0], last[1], P)
+    )
+    return Controllers(leading_axis(system), leading_axis(cost), given, stacked)
 
 
 def starts(x0: ArrayLike, nx: int, many: Controllers) -> tuple[Any, tuple[int, ...]]:

@@ -19,12 +19,12 @@ from prefmpc.mpc._expressions import (
     check_convex,
     expression,
     factor,
-    per_unit,
     quadratic,
     stage_limits,
     weights,
 )
 from prefmpc.mpc._fixed import FixedCone, FixedRows
+from prefmpc.mpc._limits import per_unit
 from prefmpc.mpc.solution import (
     Controller,
     MPCSolution,

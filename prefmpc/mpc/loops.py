@@ -208,9 +208,13 @@ def _with_plants(
 def _program(horizon: int, steps: int, *, derivative: bool = False) -> Callable[..., _Loop]:
     """Return the compiled simulation; one object for each size, so that it compiles once."""
 
-    def step_of(
-        many: Controllers, problem: Any, plants: LinearSystem, tol: Any
-    ) -> Callable[..., Any]:
+    @jax.jit
+    def run(systems: Any, costs: Any, sets: Any, plants: Any, x0: Any, tol: Any) -> _Loop:
+        many = Controllers(systems, costs, sets, stacked=True)
+        problem = many.condensed(horizon)
+        rows = problem.Y.shape[1]
+        start = x0, jnp.full(x0.shape[:2], SOLVED), jnp.zeros((*x0.shape[:2], rows))
+
         def step(now: Any, _: None) -> Any:
             x, before, start = now
             answer = solve(problem, x, tol, start=start)
@@ -221,15 +225,6 @@ def _program(horizon: int, steps: int, *, derivative: bool = False) -> Callable[
             start = many.moved_on(answer.multipliers, horizon)
             return (x_next, code, start), (x_next, u, plants.output(x), code, answer.iterations)
 
-        return step
-
-    @jax.jit
-    def run(systems: Any, costs: Any, sets: Any, plants: Any, x0: Any, tol: Any) -> _Loop:
-        many = Controllers(systems, costs, sets, stacked=True)
-        problem = many.condensed(horizon)
-        rows = problem.Y.shape[1]
-        start = x0, jnp.full(x0.shape[:2], SOLVED), jnp.zeros((*x0.shape[:2], rows))
-        step = step_of(many, problem, plants, tol)
         _, (x, u, y, codes, iterations) = jax.lax.scan(step, start, None, length=steps)
         x = jnp.concatenate([x0[None], x])
         x, u, y, codes = (jnp.moveaxis(a, 0, 2) for a in (x, u, y, codes))

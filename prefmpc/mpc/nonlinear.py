@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import threading
 import time
 from collections.abc import Callable
 from typing import Any, Literal, get_args
@@ -29,6 +28,7 @@ from prefmpc.mpc._limits import ON_LIMIT
 from prefmpc.mpc._newton import attempt, least_violation
 from prefmpc.mpc._nlp import Attempt, Program, promising, remembered
 from prefmpc.mpc._shooting import Given, Known, Problem
+from prefmpc.mpc._turns import Turns
 from prefmpc.mpc._units import Units, own_units
 from prefmpc.mpc.solution import (
     Controller,
@@ -48,7 +48,7 @@ from prefmpc.systems.sets import Ellipsoid, Polyhedron
 Solver = Literal["newton"]
 
 
-class NonlinearMPC(Controller):
+class NonlinearMPC(Turns, Controller):
     """The controller min σ(T) s.t. x_0 = x(t), x_{k+1} = f(x_k, u_k), (x_k, u_k) ∈ Z, x_N ∈ X_N.
 
     Implements eq. (7) of arXiv 2511.22502 for any plant and any differentiable σ. The inputs are
@@ -111,17 +111,9 @@ class NonlinearMPC(Controller):
             _check_path(path, system)
         self._problem = self._sets(constraints, terminal)
         self._rows = shooting.rows(self._problem, path, self.horizon)
-        self._lock = threading.RLock()  # a solve starts from the plan of the one before
+        super().__init__()  # the lock: a solve starts from the plan of the one before
         self.reset()
         self._check_cost()
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Return all but the lock, which no copy can share."""
-        return {name: value for name, value in self.__dict__.items() if name != "_lock"}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take over another controller's state, with a lock of one's own."""
-        self.__dict__.update(state, _lock=threading.RLock())
 
     def _sets(self, constraints: Any, terminal: Any) -> Problem:
         nx, nu = self.system.nx, self.system.nu

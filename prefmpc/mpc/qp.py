@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import threading
 import time
-from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,6 +14,7 @@ from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.mpc._cone import PROVEN, SOLVED, TIGHT, ConeProgram, ConeSolution
 from prefmpc.mpc._refine import Refiner
 from prefmpc.mpc._stages import Bounds, StageProgram
+from prefmpc.mpc._turns import Turns
 from prefmpc.mpc.solution import (
     Controller,
     MPCSolution,
@@ -46,7 +45,7 @@ GOOD = 1e-9
 """A residual with which nobody needs to try for a better one."""
 
 
-class LinearMPC(Controller):
+class LinearMPC(Turns, Controller):
     """The controller min σ(T) s.t. x_0 = x(t), the dynamics, (x_k, u_k) ∈ Z, x_N ∈ X_N.
 
     Implements eq. (7) of arXiv 2511.22502 for a linear plant, polyhedral sets and quadratic σ;
@@ -96,18 +95,9 @@ class LinearMPC(Controller):
         self._limited = constraints is not None or last is not None
         weights = np.asarray(cost.Q), np.asarray(cost.R)
         self._program = StageProgram(system, weights, self.horizon, constraints, last, final)
-        self._lock = threading.Lock()
-        self._solver: Any = None
+        super().__init__()
         self._backup: ConeProgram | None = None
         self._refine: Refiner | None = None
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave out the solver, which is set up again when it is needed."""
-        return {k: v for k, v in self.__dict__.items() if k not in ("_solver", "_lock")}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Take over what was pickled or copied."""
-        self.__dict__.update(state, _solver=None, _lock=threading.Lock())
 
     def solve(self, x0: ArrayLike, *, reference: SteadyState | None = None) -> MPCSolution:
         """Solve for the state x0 (nx,); see `MPCSolution`. Raises a ValueError on a bad x0.

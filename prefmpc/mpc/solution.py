@@ -93,10 +93,15 @@ def check_problem(system: Any, cost: Any) -> None:
     """Raise a ValueError unless ``cost`` is a QuadraticCost that fits the LinearSystem."""
     instance("system", system, LinearSystem)
     instance("cost", cost, QuadraticCost)
+    check_weights(cost, system.nx, system.nu)
+
+
+def check_weights(cost: QuadraticCost, nx: int, nu: int) -> None:
+    """Raise a ValueError unless the weights are finite, for nx states and nu inputs."""
     sizes = (cost.Q.shape[-1], cost.R.shape[-1])
-    if sizes != (system.nx, system.nu):
+    if sizes != (nx, nu):
         raise ValueError(
-            f"cost must weigh {system.nx} states and {system.nu} inputs like the system, "
+            f"cost must weigh {nx} states and {nu} inputs like the system, "
             f"got {sizes[0]} and {sizes[1]}"
         )
     weights = cost.theta_Q, cost.theta_R
