@@ -33,6 +33,9 @@ class Page:
             self._context.eval((SCRIPTS / f"{name}.js").read_text(encoding="utf-8"))
         self._context.eval(TAPE)
 
+    def close(self) -> None:
+        self._context.close()
+
     def __call__(self, expression: str, **values: Any) -> Any:
         """Return the value of an expression in the names given, and `ask`."""
         names = ", ".join(["ask", *values])

@@ -12,7 +12,8 @@
   const LAPSE_CENTRE = Math.log(0.04 / 0.96);
   const LAPSE_SPREAD = 1; // an estimated lapse rate has a logit of this mean and deviation
   const STEPS = 100;
-  const TOLERANCE = 1e-9;
+  const TOLERANCE = 1e-9; // of the certificate; the search itself goes on to
+  const POLISHED = 1e-18;
   const FLOOR = 1e-3;
   const ROUNDS = 30;
 
@@ -114,7 +115,7 @@
       const turned = times(transpose(vectors), times(back, gradient));
       const scaled = turned.map((g, i) => g / Math.max(Math.abs(values[i]), FLOOR));
       decrement = 0.5 * dot(turned, scaled);
-      if (decrement <= TOLERANCE && values[0] > 0) break;
+      if (decrement <= POLISHED && values[0] > 0) break;
       const inner = times(vectors, scaled), move = times(unit, inner);
       let t = Math.min(1, 4 / (Math.max(...inner.map(Math.abs)) + 1e-300)), found = false;
       for (let half = 0; half < 40 && !found; half++) {

@@ -34,11 +34,11 @@
 
   // config: see masses.js; given: {seed, log, …}, log: the lines of an earlier session.
   function interviewer(config, given = {}) {
+    const { lines, answers } = given.log ? parse(given.log) : { lines: [], answers: [] };
     const options = {
       ...DEFAULTS, centre: [...config.centre.Q, ...config.centre.R], radius: config.x0,
-      ...config.method, ...given,
+      ...config.method, ...given, ...(lines.length ? begun(lines[0]) : {}),
     };
-    const { lines, answers } = given.log ? parse(given.log) : { lines: [], answers: [] };
     const key = lines.length ? lines[0].key : [given.seed ?? ask.random.seed()];
     const source = (count, purpose) => random(...key, count, purpose);
     const belief = ask.belief.belief(options.centre.length, options, options.lapse);
@@ -101,14 +101,14 @@
       next: async () => question(),
       async answer(value) {
         const label = labelOf(value);
-        const open = question();
-        answers.push({ label, question: open });
+        answers.push({ label, question: question() });
         return progress();
       },
       async undo() {
         if (!answers.length) throw new Error("there is no answer to take back");
-        answers.pop();
+        const { question } = answers.pop();
         kept.clear();
+        kept.set(answers.length, { question });
         return progress();
       },
       progress: async () => progress(),
@@ -185,6 +185,10 @@
     if (lines[0]["prefmpc interview"] !== FORMAT) throw new Error("this is no log of an interview");
     return { lines, answers: lines.slice(1).map(({ answer, question }) => ({ label: answer, question })) };
   }
+
+  // An interview goes on as it was begun.
+  const begun = ({ spread, sharpness, coupling, steps, lapse, samples, repeat_every: repeatEvery }) =>
+    ({ spread, sharpness, coupling, steps, lapse, samples, repeatEvery });
 
   ask.interview = { DEFAULTS, interviewer, data };
 })(globalThis.prefmpcAsk = globalThis.prefmpcAsk || {});
