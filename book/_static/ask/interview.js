@@ -27,6 +27,7 @@
     level: 0.02, // enough: the regret is at most this with this probability,
     certain: 0.9,
     patience: 1, // after so many answers in a row
+    most: Infinity, // so many answers are as much as can be asked of anybody
   });
 
   // Purposes of random numbers.
@@ -80,7 +81,7 @@
       const last = Array.from({ length: options.patience }, (_, i) => n - i);
       return {
         count: n, bound: bound(n), median: quantile(regret(n), 0.5), level: options.level,
-        certain: options.certain, enough: last.every((i) => i >= 0 && bound(i) <= options.level),
+        most: options.most, certain: options.certain, enough: last.every((i) => i >= 0 && bound(i) <= options.level),
         weights: shares(config, options.centre, laplace.eta, samples.eta),
         consistency: consistency(answers),
       };

@@ -37,8 +37,8 @@
       Q: [0.3, 0.3, 0.3, 0.3, 0.3, 0.3].map((largest) => 1 / largest ** 2),
       R: [1, 1],
     },
-    // A person slips now and then; the page must not stop on a lucky answer.
-    method: { lapse: 0.03, patience: 2 },
+    // A person slips now and then, and gets tired; the page must not stop on a lucky answer.
+    method: { lapse: 0.03, patience: 2, most: 30 },
     states: [
       { name: "position of mass 1", unit: "1/m²" },
       { name: "position of mass 2", unit: "1/m²" },
@@ -51,5 +51,19 @@
       { name: "force on mass 1", unit: "1/N²" },
       { name: "force on mass 3", unit: "1/N²" },
     ],
+    // What is plotted; an output is at rest when it is near 0.
+    outputs: { label: "position in m", names: ["mass 1", "mass 2", "mass 3"], colours: [0, 1, 2], near: 0.05 },
+    forces: { label: "force in N", names: ["force on mass 1", "force on mass 3"], colours: [0, 2] },
+    draw: ask.draw && ask.draw.masses,
+    // Somebody whose answers can be watched: the weights of the paper's first case study.
+    visitor: [40, 40, 40, 5, 5, 5, 0.2, 0.2],
+    code: `import jax
+from prefmpc import Interview, LinearMPC, oscillating_masses, simulate
+
+jax.config.update("jax_enable_x64", True)
+plant, model = oscillating_masses(), Interview.load("answers.jsonl", append=False).model
+controller = LinearMPC(plant, model, horizon=10)
+print(simulate(plant, controller, [0.3, -0.3, 0.1, 0, 0, 0], steps=20).x[-1].round(3))
+`,
   });
 })(globalThis.prefmpcAsk = globalThis.prefmpcAsk || {});
