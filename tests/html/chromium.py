@@ -15,7 +15,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), "")
+BROWSER = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), ""
+)
 OPTIONS = (
     "--headless",
     "--no-sandbox",
@@ -28,7 +30,15 @@ OPTIONS = (
     "--hide-scrollbars",
     "--remote-debugging-pipe",
 )
-KEYS = {"ArrowLeft": 37, "ArrowRight": 39, "ArrowDown": 40, "Backspace": 8, " ": 32, "Tab": 9, "Enter": 13}
+KEYS = {
+    "ArrowLeft": 37,
+    "ArrowRight": 39,
+    "ArrowDown": 40,
+    "Backspace": 8,
+    " ": 32,
+    "Tab": 9,
+    "Enter": 13,
+}
 
 
 class Browser:
@@ -54,13 +64,20 @@ class Browser:
         self._session = attached["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
-        self.call("Network.emulateNetworkConditions", offline=True, latency=0,
-                  downloadThroughput=0, uploadThroughput=0)
+        self.call(
+            "Network.emulateNetworkConditions",
+            offline=True,
+            latency=0,
+            downloadThroughput=0,
+            uploadThroughput=0,
+        )
         self.resize(width, height)
         names = [{"name": k.replace("_", "-"), "value": v} for k, v in features.items()]
         self.call("Emulation.setEmulatedMedia", features=names)
-        self._call("Browser.setDownloadBehavior",
-                   {"behavior": "allow", "downloadPath": str(self.downloads)})
+        self._call(
+            "Browser.setDownloadBehavior",
+            {"behavior": "allow", "downloadPath": str(self.downloads)},
+        )
 
     def __enter__(self) -> Browser:
         return self
@@ -80,7 +97,9 @@ class Browser:
         profile = f"--user-data-dir={self._folder.name}/profile"
         self._process = subprocess.Popen(
             ["bash", "-c", shell, "bash", BROWSER, *OPTIONS, profile],
-            pass_fds=(theirs_in, theirs_out), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+            pass_fds=(theirs_in, theirs_out),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
         )
         os.close(theirs_in)
         os.close(theirs_out)
@@ -135,8 +154,9 @@ class Browser:
 
     def __call__(self, expression: str) -> Any:
         """Return the value of an expression in the page, awaited if it is a promise."""
-        out = self.call("Runtime.evaluate", expression=expression, returnByValue=True,
-                        awaitPromise=True)
+        out = self.call(
+            "Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True
+        )
         if "exceptionDetails" in out:
             raise RuntimeError(str(out["exceptionDetails"]["exception"].get("description")))
         return out["result"].get("value")
@@ -172,8 +192,13 @@ class Browser:
         self.call("Input.dispatchKeyEvent", type="keyUp", **code)
 
     def resize(self, width: int, height: int) -> None:
-        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height,
-                  deviceScaleFactor=1, mobile=width < 600)
+        self.call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=width < 600,
+        )
 
     def screenshot(self, path: Path | str) -> None:
         data = self.call("Page.captureScreenshot")["data"]

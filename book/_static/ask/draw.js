@@ -115,7 +115,7 @@
   function pointer(from, force) {
     const to = from + 52 * force, y = 20, sign = Math.sign(force);
     const head = Math.min(8, Math.abs(to - from));
-    if (head < 1) return "";
+    if (head < 3) return "";
     return `M${from.toFixed(1)} ${y}H${to.toFixed(1)}m${-sign * head} -5l${sign * head} 5l${-sign * head} 5`;
   }
 

@@ -112,6 +112,7 @@
       V[k][p] = c * v - s * w;
       V[k][q] = s * v + c * w;
     }
+    S[p][q] = S[q][p] = 0;
   }
 
   // The value that is not exceeded with probability q, between the neighbours in proportion.

@@ -101,7 +101,10 @@
       clock.to(1);
       const inside = root.contains(document.activeElement);
       cover(v, texts, session.person ? [] : buttons);
-      if (inside && !session.person) v.over.querySelector("button").focus({ preventScroll: true });
+      if (inside && !session.person) {
+        v.over.firstChild.scrollIntoView({ block: "nearest" });
+        v.over.querySelector("button").focus({ preventScroll: true });
+      }
       v.say.textContent = texts.join(" ");
     }
 

@@ -79,7 +79,8 @@
       return element("tr", {}, element("th", { scope: "row" }, name), element("td", {}, bar, hidden(interval)),
         element("td", {}, times), element("td", {}, `${weight.toPrecision(3)} ${unit}`));
     });
-    const heads = ["weight of the squared", "0.01 · 0.1 · 1 · 10 · 100", "times default", "in σ"];
+    const scale = ["0.01", "0.1", "1", "10", "100"].map((text) => element("span", {}, text));
+    const heads = ["weight of the squared", element("span", { class: "ask-scale" }, ...scale), "times default", "in σ"];
     v.weights.replaceChildren(
       element("p", {}, "Each weight compared with Bryson’s rule (the middle), after division by what all have in common, on which no controller depends. The bar holds 90 % of what your answers leave possible."),
       element("table", {}, element("thead", {}, element("tr", {}, ...heads.map((text) => element("th", { scope: "col" }, text)))), element("tbody", {}, ...rows)));

@@ -4,16 +4,16 @@
 
   const percent = (share) => {
     const value = 100 * share;
-    return `${value < 9.95 ? value.toFixed(1).replace(/\.0$/, "") : Math.round(value)} %`;
+    return `${value < 9.95 ? value.toFixed(1).replace(/\.0$/, "") : Math.round(value)}\u00a0%`;
   };
 
   // How sure the page is, as a statement about the controller.
   function sureness({ count, bound, level, certain }) {
     if (count === 0) return "I know nothing of you yet.";
     const odds = `(${Math.round(10 * certain)} chances in 10)`;
-    if (bound >= 1) return `I hardly know what you want: the controller that I would build now may be ${
+    if (bound >= 1) return `I hardly know what you want: a controller built now may be ${
       bound >= 10 ? "many times" : "more than twice"} as bad for you as the best one ${odds}.`;
-    return `The controller that I would build now is at most ${percent(bound)} worse for you than the best one ${odds}.`;
+    return `A controller built now is at most ${percent(bound)} worse for you than the best one ${odds}.`;
   }
 
   // From 0 (as bad again as the best) to 1 (near enough).
