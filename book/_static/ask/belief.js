@@ -53,7 +53,7 @@
 
   // −log posterior up to a constant, at η, and the logit of the lapse rate if `lapse` is null.
   function energy(b, at, answers, lapse) {
-    const { gap, labels } = answers, p = b.p, w = new Float64Array(p);
+    const { gap, labels } = answers, p = b.p, w = new Array(p);
     let total = 0;
     for (let i = 0; i < p; i++) {
       w[i] = Math.exp(at[i]);

@@ -53,7 +53,7 @@
   function gains(found, chosen, samples) {
     const costs = samples.eta.map((eta) => {
       const w = eta.map(Math.exp);
-      return Float64Array.from(found, (candidate) => dot(w, candidate.phi));
+      return found.map((candidate) => dot(w, candidate.phi));
     });
     const count = costs.length;
     return chosen.map(([i, j]) => {
@@ -114,7 +114,7 @@
     const found = candidates(plant, options.centre, etas, x0, options.steps);
     const loops = new Array(x0.length).fill(0);
     for (const { start } of found) loops[start] += 1;
-    const phi = etas.map(() => new Float64Array(eta.length));
+    const phi = etas.map(() => new Array(eta.length).fill(0));
     for (const candidate of found) {
       if (loops[candidate.start] < etas.length) continue;
       candidate.phi.forEach((value, i) => { phi[candidate.source][i] += value; });
