@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from functools import cache
 
 import control
@@ -25,6 +26,15 @@ LIMITS = p.Polyhedron.box([-5, -5, -1], [5, 5, 1])
 PRIOR = p.WishartPrior(np.eye(2), [[1.0]])
 PERSON = p.QuadraticPreference(np.eye(2), [[1.0]])
 ICNN = p.ICNNCost.random([1.0, 1, 1], key=KEY, widths=(2,), floor=0.1)
+
+
+def unlogged(**options):
+    return p.Interview(**options)
+
+
+unlogged.__signature__ = inspect.Signature(
+    [v for k, v in inspect.signature(p.Interview).parameters.items() if k != "log"]
+)
 
 
 def linear(x, u):
@@ -64,6 +74,7 @@ def valid_calls():
     nets = p.MLPCost.random([1.0, 1, 1], key=KEY, widths=(2,), shape=(2,))
     tracker = p.ReferenceTracker(p.LinearMPC(SYSTEM, COST, 3), [0.0, 0.0])
     nonlinear = p.NonlinearMPC(SYSTEM, COST, 3)
+    interview = p.Interview(SYSTEM, PRIOR, x0=np.ones(2), key=0, samples=20, steps=3)
     deviations = {"x_r": np.ones(2), "u_r": np.ones(1), "y_r": np.ones(2), "u_before": np.ones(1)}
     out = {
         # plants
@@ -273,6 +284,20 @@ def valid_calls():
             p.choose_prior,
             {"comparisons": DATA, "priors": [PRIOR], "by": "evidence", "folds": 2, **SHARED},
         ),
+        # asking
+        "Interview": (
+            unlogged,
+            {
+                **{"system": SYSTEM, "prior": PRIOR, "x0": np.ones(2), "key": KEY, "spread": 2.0},
+                **{"structure": "diagonal", "sharpness": 2.0, "coupling": 0.5, "steps": 3},
+                **{"controller": "mpc", "horizon": 3, "constraints": LIMITS, "pool": POOL},
+                **{"choose": "information", "lapse": 0.0, "repeat_every": 8, "samples": 50},
+            },
+        ),
+        "Interview.next_batch": (interview.next_batch, {"size": 2}),
+        "Interview.answer": (interview.answer, {"value": "first"}),
+        "Interview.answer_with": (interview.answer_with, {"preference": PERSON, "count": 1}),
+        "Interview.finished": (interview.finished, {"level": 0.02, "q": 0.9, "least_gain": 0.0}),
         # controllers
         "LinearMPC": (p.LinearMPC, {**MPC, "terminal": ingredients}),
         "LinearMPC.solve": (

@@ -187,6 +187,18 @@ None, comparisons | validation
 [], one more | output_cones
 None, first negative, ragged | steady_state: start
 None, plant, plants | plants
+None, deeper, raises, says NaN, says a matrix, says nothing, says text | Interview: x0
+raises, says NaN, says a matrix, says nothing, says text | Interview: controller
+None, cost, costs, larger cost, network, pool, raises, says NaN | Interview: pool
+cost, costs, larger cost, network, raises, says NaN, says a matrix | Interview: choose
+None, prior | Interview: prior
+0, 10^30, 10^400, key | Interview: key
+1.5, 10^30 | spread
+0, 1.5, 10^30 | sharpness
+0, None | Interview.answer: value
+0, 1.5, 10^30, inf | least_gain
+0 | lapse, repeat_every
+0, 1.5, 10^30 | Interview.finished: level
 """
 """What is right after all | for which argument of all calls, or of one call, which goes before."""
 
@@ -195,6 +207,8 @@ ACCEPTED = {
     for labels, arguments in (line.split(" | ") for line in TABLE.strip().splitlines())
     for argument in arguments.split(", ")
 }
+ACCEPTED["Interview: pool"] += ["says a matrix", "says nothing", "says text", "shorter pool"]
+ACCEPTED["Interview: choose"] += ["says nothing", "says text"]
 
 
 def accepted(name, argument):

@@ -31,6 +31,7 @@ EXEMPT = {
                 "NetworkFit",
                 "Posterior",
                 "PriorChoice",
+                "Question",
                 "SteadyState",
                 "TerminalIngredients",
                 "WinRate",

@@ -171,6 +171,7 @@ MADE = {
         "NetworkFit",
         "Posterior",
         "PriorChoice",
+        "Question",
         "StabilityCheck",
         "SteadyState",
         "TerminalIngredients",

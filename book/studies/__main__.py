@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from studies import (
+    asking,
     lane,
     measures,
     onesided,
@@ -86,6 +87,14 @@ STUDIES: dict[str, Study] = {
         {
             **{"sizes": onesided.ONESIDED_SIZES, "learners": onesided.LEARNERS},
             "controllers": onesided.CONTROLLERS,
+        },
+    ),
+    "asking": (
+        asking.asking_case,
+        "extensions/asking_spread.json",
+        {
+            **{"people": asking.PEOPLE, "strategies": tuple(asking.STRATEGIES)},
+            "counts": asking.COUNTS,
         },
     ),
     "references": (

@@ -76,9 +76,15 @@ def same_start_data(
     return Comparisons.random(trajectories, preference, size, key=rng, same_start=True)
 
 
-def unsure_scale(pool: Trajectory, error: float = 0.1) -> float:
+def unsure_scale(
+    pool: Trajectory,
+    error: float = 0.1,
+    *,
+    Q: np.ndarray = QUADRATIC_Q,
+    R: np.ndarray = QUADRATIC_R,
+) -> float:
     """Return the scale of `logistic` at which a person errs on ``error`` of random pairs of φ."""
-    cost = np.asarray(phi(pool, QUADRATIC_Q, QUADRATIC_R))
+    cost = np.asarray(phi(pool, Q, R))
     gap = np.abs(cost[:, None] - cost)[np.triu_indices(len(pool), 1)]
     low, high = 1e-6 * gap.max(), 1e3 * gap.max()
     for _ in range(60):

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import expit
 
 from prefmpc.asking.features import FeatureMap
+from prefmpc.asking.likelihood import lapsing
 
 LAPSE_CENTRE = np.log(0.04 / 0.96)
 LAPSE_SPREAD = 1.0
 """An estimated lapse rate has a logit with this mean and standard deviation: 1 % to 15 % or so."""
 
+LEVELS = np.linspace(-3.0, 3.0, 13)
+"""Sharpnesses at which Laplace's method is applied, in standard deviations of the prior's."""
+
 STEPS = 100
 TOLERANCE = 1e-9
-SLICES = 8
+FLAT = 1e-3
+"""No curvature counts as less than this share of the prior's."""
+
+SLICES = 5
 """Updates of every sample that starts from Laplace's Gaussian."""
 
 
@@ -26,10 +35,9 @@ class Prior:
     Attributes
     ----------
     spread : float
-        Standard deviation of each log weight about the centre.
+        Standard deviation of each log weight about what all have in common.
     sharpness : float
-        Standard deviation of what all log weights have in common, in addition: how sharp a
-        person's answers are is known less than what they weigh against what.
+        Standard deviation of what all log weights have in common: how sharp the answers are.
     coupling : float
         Standard deviation of the other coordinates.
     """
@@ -38,37 +46,36 @@ class Prior:
     sharpness: float
     coupling: float
 
-    def covariance(self, diagonal: np.ndarray) -> np.ndarray:
-        """Return the covariance (p, p) of η; ``diagonal`` says which entries are log weights."""
-        own = np.where(diagonal, self.spread, self.coupling) ** 2
-        return np.diag(own) + self.sharpness**2 * np.outer(diagonal, diagonal)
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Laplace:
-    """The Gaussian about a most probable η.
+    """Gaussians about the most probable points, one for each level of sharpness.
 
     Attributes
     ----------
     eta : array (p,)
+        The most probable η at the sharpness that the answers speak for most.
     lapse : float
-        The given lapse rate, or the most probable one.
+        The given lapse rate, or the most probable one there.
     decrement : float
-        Half the squared Newton decrement where the iteration stopped, with the exact Hessian.
+        Half the squared Newton decrement there, with the exact Hessian.
     curvature : float
-        The least eigenvalue of that Hessian in units in which the prior's is 1.
-    root : array (q, q)
-        Covariance = root·rootᵀ, of η and of the logit of the lapse rate if that is estimated.
-    at : array (q,)
-        η, and that logit.
+        The least eigenvalue of that Hessian, in units in which the prior's is 1.
+    at : array (K, q)
+        The centres, in units in which the prior is a standard Gaussian.
+    roots : array (K, q, q)
+        Covariance = root·rootᵀ.
+    weights : array (K,)
+        How probable each level is.
     """
 
     eta: np.ndarray
     lapse: float
     decrement: float
     curvature: float
-    root: np.ndarray
     at: np.ndarray
+    roots: np.ndarray
+    weights: np.ndarray
 
     @property
     def success(self) -> bool:
@@ -79,10 +86,16 @@ class Laplace:
 class Belief:
     """The posterior of η for P(first preferred) = ε/2 + (1 − ε)·logistic(σ(second) − σ(first)).
 
+    A person whose answers are hardly sharper than chance leaves all weights possible; a sharp one
+    leaves few. Where questions halve what is possible, few sharp weights explain whatever is
+    answered, so that the most probable point of all is sharp and says nothing. Hence Laplace's
+    method is applied for each of several sharpnesses, which are then weighed by their evidence.
+
     Neither in η nor with a lapse rate ε is −log posterior convex in general. The number that is
-    computed is therefore the certificate of a local minimum: the Newton decrement and the least
-    eigenvalue of the exact Hessian there. With ε > 0 the search starts from the solution for
-    ε = 0, that one from the centre of the prior, so that the result is a function of the answers.
+    computed is the certificate of a local minimum: the Newton decrement, and the least eigenvalue
+    of the exact Hessian. The search starts where answers say next to nothing, at the lowest
+    sharpness and at the prior's centre, where the problem is convex, and follows the minimum from
+    level to level, first with ε = 0: the result is a function of the answers alone.
 
     Parameters
     ----------
@@ -94,13 +107,18 @@ class Belief:
 
     def __init__(self, features: FeatureMap, prior: Prior, lapse: float | None) -> None:
         self.features, self.chart, self.lapse = features, features.chart, lapse
-        covariance = prior.covariance(self.chart.diagonal)
-        self._unit = np.linalg.cholesky(covariance)
-        self.precision = np.linalg.inv(covariance)
-        self.p = len(covariance)
+        diagonal = self.chart.diagonal
+        self.p, d = diagonal.size, int(diagonal.sum())
+        # η = level·common + basis·v with a standard Gaussian v.
+        self._common = diagonal * float(np.hypot(prior.sharpness, prior.spread / np.sqrt(d)))
+        ratios = np.linalg.svd(np.ones((1, d)))[2][1:].T
+        basis = np.zeros((self.p, self.p - 1))
+        basis[diagonal, : d - 1] = prior.spread * ratios
+        basis[~diagonal, d - 1 :] = prior.coupling * np.eye(self.p - d)
+        self._basis = basis
 
     def fit(self, gap: np.ndarray, labels: np.ndarray) -> Laplace:
-        """Return the Gaussian about the most probable η.
+        """Return the Gaussians about the most probable η.
 
         Parameters
         ----------
@@ -109,99 +127,114 @@ class Belief:
         labels : array (n,)
             P(first preferred) in [0, 1].
         """
-        plain = self._newton(np.zeros(self.p), gap, labels, 0.0)
-        if self.lapse == 0.0:
-            return plain
-        if self.lapse is None:
-            return self._newton(np.append(plain.eta, LAPSE_CENTRE), gap, labels, None)
-        return self._newton(plain.eta, gap, labels, self.lapse)
+        data = gap, labels
+        minima = []
+        at = np.zeros(self.p - 1)
+        for level in LEVELS:
+            found = self._newton(at, level, *data, 0.0)
+            at = found.at
+            if self.lapse is None:
+                found = self._newton(np.append(at, 0.0), level, *data, None)
+            elif self.lapse:
+                found = self._newton(at, level, *data, self.lapse)
+            minima.append(found)
+        evidence = np.array([m.evidence for m in minima])
+        weights = np.exp(evidence - evidence.max())
+        best = minima[int(np.argmax(weights))]
+        return Laplace(
+            eta=self._eta(best.at[None], LEVELS[np.argmax(weights)])[0],
+            lapse=float(self._rate(best.at)) if self.lapse is None else self.lapse,
+            decrement=best.decrement,
+            curvature=best.curvature,
+            at=np.stack([m.at for m in minima]),
+            roots=np.stack([m.root for m in minima]),
+            weights=weights / weights.sum(),
+        )
+
+    def _eta(self, at: np.ndarray, level: Any) -> np.ndarray:
+        """Return η (m, p) at points (m, q) and levels () or (m,)."""
+        level = np.broadcast_to(level, len(at))
+        return level[:, None] * self._common + at[:, : self.p - 1] @ self._basis.T
+
+    @staticmethod
+    def _rate(at: np.ndarray) -> Any:
+        """Return an estimated lapse rate."""
+        return expit(LAPSE_CENTRE + LAPSE_SPREAD * at[..., -1])
 
     def _newton(
-        self, at: np.ndarray, gap: np.ndarray, labels: np.ndarray, lapse: float | None
-    ) -> Laplace:
-        """Minimise −log posterior by Newton's method with directions of negative curvature turned.
-
-        Scaled so that the prior is a standard Gaussian.
-        """
-        unit = np.eye(len(at))
-        unit[: self.p, : self.p] = self._unit
-        if lapse is None:
-            unit[-1, -1] = LAPSE_SPREAD
-        now = self._energy(at[None], gap, labels, lapse)[0]
+        self,
+        at: np.ndarray,
+        level: float,
+        gap: np.ndarray,
+        labels: np.ndarray,
+        lapse: float | None,
+    ) -> _Minimum:
+        """Minimise −log posterior by Newton's method; directions of negative curvature turn."""
+        data = gap, labels, lapse
+        now = self._energy(at[None], level, *data)[0]
         for _ in range(STEPS):
-            gradient, hessian = self._slopes(at, gap, labels, lapse)
-            values, vectors = np.linalg.eigh(unit.T @ hessian @ unit)
-            turned = vectors.T @ (unit.T @ gradient)
-            size = np.maximum(np.abs(values), 1e-3)
+            gradient, hessian = self._slopes(at, level, *data)
+            values, vectors = np.linalg.eigh(hessian)
+            turned = vectors.T @ gradient
+            size = np.maximum(np.abs(values), FLAT)
             decrement = float(0.5 * turned @ (turned / size))
             if decrement <= TOLERANCE and values[0] > 0:
                 break
-            step = -unit @ (vectors @ (turned / size))
-            t = min(1.0, 4.0 / (np.abs(np.linalg.solve(unit, step)).max() + 1e-300))
-            for _ in range(40):
-                trial = self._energy((at + t * step)[None], gap, labels, lapse)[0]
+            step = -vectors @ (turned / size)
+            t = min(1.0, 3.0 / np.abs(step).max())
+            while t > 1e-10:
+                trial = self._energy((at + t * step)[None], level, *data)[0]
                 if trial <= now - 0.2 * t * decrement + 1e-13 * abs(now):
                     break
                 t /= 2
             else:
                 break
             at, now = at + t * step, trial
-        root = unit @ (vectors / np.sqrt(np.maximum(values, 1e-3)))
-        return Laplace(
-            eta=at[: self.p],
-            lapse=float(expit(at[-1])) if lapse is None else lapse,
-            decrement=decrement if np.isfinite(now) else np.inf,
-            curvature=float(values[0]),
-            root=root,
-            at=at,
-        )
+        size = np.maximum(values, FLAT)
+        evidence = -now - 0.5 * np.log(size).sum() - 0.5 * level**2
+        decrement = decrement if np.isfinite(now) else np.inf
+        return _Minimum(at, vectors / np.sqrt(size), float(evidence), decrement, float(values[0]))
 
     def _energy(
-        self, at: np.ndarray, gap: np.ndarray, labels: np.ndarray, lapse: float | None
+        self, at: np.ndarray, level: Any, gap: np.ndarray, labels: np.ndarray, lapse: float | None
     ) -> np.ndarray:
         """Return −log posterior (m,) up to a constant at points (m, q)."""
-        eta = at[:, : self.p]
-        prior = 0.5 * np.einsum("mi,ij,mj->m", eta, self.precision, eta)
         with np.errstate(over="ignore", invalid="ignore"):
-            z = self.chart.weights(eta) @ gap.T
-            if lapse is None:
-                prior = prior + 0.5 * ((at[:, -1] - LAPSE_CENTRE) / LAPSE_SPREAD) ** 2
-                loss = _lapsing(z, labels, expit(at[:, -1:]))[0]
-            elif lapse:
-                loss = _lapsing(z, labels, lapse)[0]
+            z = self.chart.weights(self._eta(at, level)) @ gap.T
+            if lapse == 0.0:
+                loss = np.maximum(z, 0) + np.log1p(np.exp(-np.abs(z))) - labels * z
             else:
-                loss = np.logaddexp(0, z) - labels * z
-            total = prior + loss.sum(-1)
+                rate = self._rate(at)[:, None] if lapse is None else lapse
+                loss = lapsing(z, labels, rate)[0]
+            total = 0.5 * (at**2).sum(-1) + loss.sum(-1)
         return np.where(np.isfinite(total), total, np.inf)
 
     def _slopes(
-        self, at: np.ndarray, gap: np.ndarray, labels: np.ndarray, lapse: float | None
+        self, at: np.ndarray, level: float, gap: np.ndarray, labels: np.ndarray, lapse: float | None
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return gradient (q,) and Hessian (q, q) of −log posterior."""
-        eta = at[: self.p]
+        eta, n = self._eta(at[None], level)[0], self.p - 1
         jacobian, second = self.chart.derivatives(eta)
         z = gap @ self.chart.weights(eta)
         if lapse == 0.0:
             s = expit(z)
             slope, curvature = s - labels, s * (1 - s)
         else:
-            rate = expit(at[-1]) if lapse is None else lapse
-            _, slope, curvature, by_rate = _lapsing(z, labels, rate)
-        g = gap.T @ slope
-        to_eta = gap @ jacobian
-        gradient = jacobian.T @ g + self.precision @ eta
-        hessian = to_eta.T @ (curvature[:, None] * to_eta) + second(g) + self.precision
-        if lapse is not None:
-            return gradient, hessian
-        step, bend = rate * (1 - rate), rate * (1 - rate) * (1 - 2 * rate)
-        first, mixed, twice = by_rate
-        theta = (at[-1] - LAPSE_CENTRE) / LAPSE_SPREAD**2
-        corner = step**2 * twice.sum() + bend * first.sum() + 1 / LAPSE_SPREAD**2
-        side = step * (to_eta.T @ mixed)
-        return (
-            np.append(gradient, step * first.sum() + theta),
-            np.block([[hessian, side[:, None]], [side[None], np.array([[corner]])]]),
-        )
+            rate = self._rate(at) if lapse is None else lapse
+            _, slope, curvature, by_rate = lapsing(z, labels, rate)
+        to_at = gap @ (jacobian @ self._basis)
+        gradient, hessian = at.copy(), np.eye(len(at))
+        gradient[:n] += to_at.T @ slope
+        hessian[:n, :n] += to_at.T @ (curvature[:, None] * to_at)
+        hessian[:n, :n] += self._basis.T @ second(gap.T @ slope) @ self._basis
+        if lapse is None:
+            first, mixed, twice = by_rate
+            step = LAPSE_SPREAD * rate * (1 - rate)
+            gradient[n] += step * first.sum()
+            bend = LAPSE_SPREAD * step * (1 - 2 * rate)
+            hessian[n, n] += step**2 * twice.sum() + bend * first.sum()
+            hessian[n, :n] = hessian[:n, n] = step * (to_at.T @ mixed)
+        return gradient, hessian
 
     def draws(
         self,
@@ -215,27 +248,43 @@ class Belief:
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return η (count, p) and lapse rates (count,) from the posterior.
 
-        Elliptical slice sampling about Laplace's Gaussian, all chains at once: each starts from a
-        draw of the Gaussian and is moved ``slices`` times; with 0 they are Laplace's draws.
+        Elliptical slice sampling about Laplace's Gaussians, all chains at once: each starts from
+        a draw and is moved ``slices`` times at its level; with 0 they are Laplace's draws.
         """
-        q = len(laplace.at)
-        lapse = self.lapse if q == self.p else None
+        q = laplace.at.shape[1]
+        lapse = self.lapse if q == self.p - 1 else None
+        which = rng.choice(len(LEVELS), count, p=laplace.weights)
+        level, centre, root = LEVELS[which], laplace.at[which], laplace.roots[which]
         x = rng.standard_normal((count, q))
 
-        def excess(x: np.ndarray) -> np.ndarray:
+        def point(x: np.ndarray, i: Any) -> np.ndarray:
+            return centre[i] + np.einsum("mij,mj->mi", root[i], x)
+
+        def excess(x: np.ndarray, i: Any) -> np.ndarray:
             """Return log posterior − log of the Gaussian, up to a constant."""
-            at = laplace.at + x @ laplace.root.T
-            return 0.5 * (x**2).sum(-1) - self._energy(at, gap, labels, lapse)
+            return 0.5 * (x**2).sum(-1) - self._energy(point(x, i), level[i], gap, labels, lapse)
 
-        level = excess(x) if slices else np.zeros(count)
+        all_ = np.arange(count)
+        if slices:
+            height = excess(x, all_)
         for _ in range(slices):
-            x, level = _slice(x, level, excess, rng)
-        at = laplace.at + x @ laplace.root.T
-        rates = expit(at[:, -1]) if lapse is None else np.full(count, lapse)
-        return at[:, : self.p], rates
+            x, height = _slice(x, height, excess, rng)
+        at = point(x, all_)
+        rates = self._rate(at) if lapse is None else np.full(count, lapse)
+        return self._eta(at, level), rates
 
 
-def _slice(x, level, excess, rng):  # type: ignore[no-untyped-def]
+class _Minimum(NamedTuple):
+    at: np.ndarray
+    root: np.ndarray
+    evidence: float
+    decrement: float
+    curvature: float
+
+
+def _slice(
+    x: np.ndarray, level: np.ndarray, excess: Callable[..., np.ndarray], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """Move every chain (m, q) once: Murray, Adams and MacKay's elliptical slice sampling."""
     count = len(x)
     other = rng.standard_normal(x.shape)
@@ -247,7 +296,7 @@ def _slice(x, level, excess, rng):  # type: ignore[no-untyped-def]
     for _ in range(30):
         a = angle[open_, None]
         trial = np.cos(a) * x[open_] + np.sin(a) * other[open_]
-        found = excess(trial)
+        found = excess(trial, open_)
         good = found >= floor[open_]
         new[open_[good]], value[open_[good]] = trial[good], found[good]
         open_ = open_[~good]
@@ -258,18 +307,3 @@ def _slice(x, level, excess, rng):  # type: ignore[no-untyped-def]
         high[open_] = np.where(below, high[open_], angle[open_])
         angle[open_] = rng.uniform(low[open_], high[open_])
     return new, value
-
-
-def _lapsing(z, labels, rate):  # type: ignore[no-untyped-def]
-    """Return the loss, its two derivatives by z, and those by the rate: ∂ε, ∂ε∂z and ∂ε²."""
-    s = expit(z)
-    p = rate / 2 + (1 - rate) * s
-    q = rate / 2 + (1 - rate) * (1 - s)
-    loss = -labels * np.log(p) - (1 - labels) * np.log(q)
-    by_p = (1 - labels) / q - labels / p
-    by_pp = labels / p**2 + (1 - labels) / q**2
-    ds = s * (1 - s)
-    p_z, p_zz, p_e, p_ez = (1 - rate) * ds, (1 - rate) * ds * (1 - 2 * s), 0.5 - s, -ds
-    curvature = by_pp * p_z**2 + by_p * p_zz
-    by_rate = by_p * p_e, by_pp * p_e * p_z + by_p * p_ez, by_pp * p_e**2
-    return loss, by_p * p_z, curvature, by_rate

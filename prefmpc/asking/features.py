@@ -57,6 +57,15 @@ class Chart:
         L = self.factor(eta)
         return (L @ L.swapaxes(-1, -2))[..., self.rows, self.columns]
 
+    def mean_weights(self, eta: np.ndarray) -> np.ndarray:
+        """Return the mean (p,) of weights of equal sharpness, for samples η (m, p).
+
+        Sharpness is the mean of the log weights; that of the mean is its own mean.
+        """
+        sharpness = eta[:, self.diagonal].mean(axis=1)
+        relative = self.weights(eta) * np.exp(-sharpness)[:, None]
+        return relative.mean(axis=0) * np.exp(sharpness.mean())
+
     def derivatives(self, eta: np.ndarray) -> tuple[np.ndarray, Any]:
         """Return ∂w/∂η (p, p), and the function g (p,) ↦ Σ_k g_k ∂²w_k/∂η² (p, p)."""
         if self.diagonal.all():
@@ -95,8 +104,8 @@ class FeatureMap(Protocol):
     def __call__(self, trajectory: Trajectory) -> np.ndarray:
         """Return φ (..., p)."""
 
-    def model(self, eta: np.ndarray) -> CostModel:
-        """Return σ, or a stack of them, for η (p,) or (m, p)."""
+    def model(self, w: np.ndarray) -> CostModel:
+        """Return σ, or a stack of them, for weights (p,) or (m, p)."""
 
 
 class QuadraticFeatures:
@@ -129,16 +138,13 @@ class QuadraticFeatures:
             parts.append(inner[..., i, j] * np.where(i == j, 1.0, 2.0))
         return np.concatenate(parts, axis=-1)
 
-    def matrices(self, eta: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return Q (..., nx, nx) and R (..., nu, nu)."""
-        L, n = self.chart.factor(eta), len(self.roots[0])
-        halves = self.roots[0] @ L[..., :n, :n], self.roots[1] @ L[..., n:, n:]
-        Q, R = (half @ half.swapaxes(-1, -2) for half in halves)
-        return Q, R
-
-    def model(self, eta: np.ndarray) -> QuadraticCost:
+    def model(self, w: np.ndarray) -> QuadraticCost:
         """Return σ, or a stack of them."""
-        return QuadraticCost(*self.matrices(eta))
+        n, rows, columns = len(self.roots[0]), self.chart.rows, self.chart.columns
+        W = np.zeros((*w.shape[:-1], self.chart.size, self.chart.size))
+        W[..., rows, columns] = W[..., columns, rows] = w
+        blocks = W[..., :n, :n], W[..., n:, n:]
+        return QuadraticCost(*(C @ M @ C.T for C, M in zip(self.roots, blocks, strict=True)))
 
 
 class SeparableFeatures:
@@ -159,7 +165,7 @@ class SeparableFeatures:
         """Return the features (..., p) times the centre's weights."""
         return np.asarray(self.centre.features(trajectory)) * np.ravel(self.centre.c)
 
-    def model(self, eta: np.ndarray) -> SeparableCost:
+    def model(self, w: np.ndarray) -> SeparableCost:
         """Return σ, or a stack of them."""
-        c = np.exp(eta).reshape(*eta.shape[:-1], *np.shape(self.centre.c)) * self.centre.c
+        c = w.reshape(*w.shape[:-1], *np.shape(self.centre.c)) * self.centre.c
         return SeparableCost(c, scale=np.array(self.centre.scale))

@@ -9,16 +9,17 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from prefmpc._checks import function, number, positive_int
+from prefmpc._checks import function, nonnegative, positive_int
 from prefmpc._files import atomic_write
+from prefmpc.asking.answers import Answer, label_of, line_of, replayed
 from prefmpc.asking.belief import Laplace
 from prefmpc.asking.criteria import Criterion
-from prefmpc.asking.log import Log, encoded, read, trajectory_from
+from prefmpc.asking.log import Log, encoded, read
 from prefmpc.asking.loops import Controller
-from prefmpc.asking.making import Answer, State, make, state_after
+from prefmpc.asking.making import State, make, state_after
 from prefmpc.asking.options import Options
 from prefmpc.asking.questions import Question, stacked
-from prefmpc.asking.regret import Consistency, Regret, regret_of
+from prefmpc.asking.regret import Consistency, Regret, consistency_of, regret_of
 from prefmpc.asking.sources import Pool
 from prefmpc.learning.convex import MapResult, fit_map
 from prefmpc.learning.priors import WishartPrior
@@ -45,7 +46,7 @@ class Interview:
         A `LinearSystem`, or any with a ``controller`` of your own.
     prior : WishartPrior or SeparableCost, optional
         Its mode (its weights) is the centre of what is believed: log weights are Gaussian about
-        it. Default: Bryson's rule with the largest x(0) and the input limits.
+        it. Default: Bryson's rule with what responses from x(0) reach, and the input limits.
     x0 : array (nx,), array (m, nx), or function
         Half-widths of a box, a list of states, or (generator, n) ↦ (n, nx).
     key : JAX key or int
@@ -150,10 +151,10 @@ class Interview:
         ValueError
             If it is none of these.
         """
-        label = _label(value)
+        label = label_of(value)
         answer = Answer(self.next(), label, self._batch)
         if self._log is not None:
-            self._log.append(_line(len(self), answer))
+            self._log.append(line_of(len(self), answer))
         self._answers.append(answer)
 
     def answer_with(self, preference: Preference, count: int) -> None:
@@ -207,17 +208,21 @@ class Interview:
 
     @property
     def model(self) -> CostModel:
-        """The σ to use now: the most probable log weights."""
-        return self._belief.features.model(self._state(len(self)).laplace.eta)
+        """The σ to use now: the mean over the posterior of the weights at equal sharpness.
+
+        It minimises what is expected of the person's own cost, in units in which all that they
+        may want counts alike.
+        """
+        return self._belief.features.model(self._state(len(self)).mean)
 
     @property
     def posterior(self) -> CostModel:
         """Equally probable σ after the answers, a stack."""
-        return self._belief.features.model(self._state(len(self)).eta)
+        return self._belief.features.model(self._state(len(self)).w)
 
     @property
     def certificate(self) -> Laplace:
-        """The numbers that say that `model` is a local maximum of the posterior density."""
+        """The numbers that say that a local maximum of the posterior density was found."""
         return self._state(len(self)).laplace
 
     @property
@@ -241,24 +246,13 @@ class Interview:
         n = len(self)
         return self._once(
             ("regret", n, 0),
-            lambda: regret_of(self._state(n).laplace.eta, self._state(n).eta, self._options),
+            lambda: regret_of(self._state(n).mean, self._state(n).w, self._options),
         )
 
     @property
     def consistency(self) -> Consistency:
         """What the repeated questions say of the person."""
-        labels = self.labels
-        pairs = [
-            (labels[i], 1 - labels[q.repeats])
-            for i, q in enumerate(self.questions)
-            if q.repeats is not None and not np.isnan(labels[[i, q.repeats]]).any()
-        ]
-        known = labels[~np.isnan(labels)]
-        return Consistency(
-            repeats=len(pairs),
-            equal=float(np.mean([1 - abs(a - b) for a, b in pairs])) if pairs else np.nan,
-            first=float(known.mean()) if known.size else np.nan,
-        )
+        return consistency_of(self.questions, self.labels)
 
     def finished(self, level: float = 0.02, q: float = 0.9, least_gain: float = 0.0) -> str | None:
         """Return why to stop asking, None if there is reason to go on.
@@ -270,6 +264,7 @@ class Interview:
         least_gain : float
             What an answer costs, in nats: stop if the next question is worth less.
         """
+        least_gain = nonnegative("least_gain", least_gain, allow_inf=True)
         if self.regret.stop(level, q):
             return f"the regret is at most {100 * level:g} % with probability {q:g}"
         if self.next().gain < least_gain:
@@ -280,10 +275,12 @@ class Interview:
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
         """Write the whole interview as a log, which `load` resumes."""
+        if not isinstance(path, str | os.PathLike):
+            raise ValueError(f"path must be a path, got {type(path).__name__}")
         with atomic_write(path, overwrite=overwrite) as file:
             file.write(encoded(self._options.stored()))
             for number, answer in enumerate(self._answers):
-                file.write(encoded(_line(number, answer)))
+                file.write(encoded(line_of(number, answer)))
 
     @classmethod
     def load(cls, path: str | os.PathLike[str], *, append: bool = True, **functions: Any) -> Self:
@@ -305,13 +302,7 @@ class Interview:
         """
         lines, size = read(path)
         interview = cls(**Options.arguments(lines[0], functions))
-        answers = interview._answers
-        for line in lines[1:]:
-            if "undo" in line:
-                interview._batch = answers.pop().batch
-            else:
-                answers.append(_from_line(line))
-                interview._batch = answers[-1].batch
+        interview._answers, interview._batch = replayed(lines[1:], path)
         if append:
             interview._log = Log(path, size)
         return interview
@@ -348,37 +339,3 @@ class Interview:
             self._cache = {k: v for k, v in self._cache.items() if k[1] in kept}
             self._cache[name] = value
         return self._cache[name]
-
-
-def _label(value: Any) -> float:
-    if value is None or (isinstance(value, str) and value == "skip"):
-        return float("nan")
-    if isinstance(value, str):
-        if value in ("first", "second"):
-            return float(value == "first")
-    else:
-        p = number("value", value)
-        if 0 <= p <= 1:
-            return p
-    raise ValueError(
-        f'value must be "first", "second", "skip", None or a probability in [0, 1], got {value!r}'
-    )
-
-
-def _line(count: int, answer: Answer) -> dict[str, Any]:
-    """Return the line of a log for the answer to a question."""
-    label = None if np.isnan(answer.label) else answer.label
-    return {
-        "answer": label,
-        "number": count,
-        "batch": answer.batch,
-        "question": vars(answer.question),
-    }
-
-
-def _from_line(line: dict[str, Any]) -> Answer:
-    stored = line["question"]
-    sides = {side: trajectory_from(stored[side]) for side in ("first", "second")}
-    label = float("nan") if line["answer"] is None else float(line["answer"])
-    start, size = line["batch"]
-    return Answer(Question(**{**stored, **sides}), label, (start, size))

@@ -20,6 +20,10 @@ Loops = Callable[[Any, np.ndarray], Trajectory]
 
 Controller = Literal["lqr", "mpc"] | Loops
 
+CONTROLLERS = 12
+STATES = 12
+"""So many samples of the posterior and so many x(0) make the closed loops of one question."""
+
 DOUBLINGS = 60
 
 
@@ -63,7 +67,12 @@ def gains(system: LinearSystem, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
         K = np.linalg.solve(R + B.T @ P @ B, B.T @ PA)
         miss = np.abs(Q + A.T @ P @ (A - B @ K) - P).max((-2, -1)) / np.abs(P).max((-2, -1))
     for i in np.flatnonzero(~(miss < RICCATI)):
-        K[i] = system.lqr(Q[i], R[i])[0]
+        try:
+            K[i] = system.lqr(Q[i], R[i])[0]
+        except ValueError as error:
+            raise ValueError(
+                f"system cannot be controlled with weights that the answers leave possible: {error}"
+            ) from None
     return K
 
 
@@ -84,10 +93,14 @@ def loops_of(
         return lambda models, x0: lqr_loops(system, models, x0, steps)
 
     def mpc(models: QuadraticCost, x0: np.ndarray) -> Trajectory:
-        runs = closed_loops(
-            system, models, x0, horizon=horizon, steps=steps, constraints=constraints
-        )
-        return runs.trajectories
+        count, parts = models.batch_shape[0], []
+        for begin in range(0, count, CONTROLLERS):  # of one size, so that it compiles once
+            part = models[np.minimum(np.arange(begin, begin + CONTROLLERS), count - 1)]
+            runs = closed_loops(
+                system, part, x0, horizon=horizon, steps=steps, constraints=constraints
+            )
+            parts.append(runs.trajectories)
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
 
     return mpc
 

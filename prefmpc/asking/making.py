@@ -7,8 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from prefmpc._checks import real_array
+from prefmpc.asking.answers import Answer
 from prefmpc.asking.belief import Belief, Laplace
 from prefmpc.asking.criteria import CRITERIA
+from prefmpc.asking.loops import CONTROLLERS, STATES
 from prefmpc.asking.options import Options
 from prefmpc.asking.questions import (
     Candidates,
@@ -18,38 +20,23 @@ from prefmpc.asking.questions import (
     probability,
     stacked,
 )
-from prefmpc.asking.sources import (
-    CONTROLLERS,
-    STATES,
-    Shown,
-    check_pool,
-    loops_shown,
-    pool_shown,
-)
+from prefmpc.asking.sources import Shown, check_pool, loops_shown, pool_shown
 from prefmpc.preferences.trajectories import Trajectory
 
 RECENT = 4
 """A question is repeated when at least so many others came in between."""
 
 
-class Answer(NamedTuple):
-    """A question and its answer."""
-
-    question: Question
-    label: float
-    """P(first preferred), NaN for a skipped question."""
-    batch: tuple[int, int]
-    """How many answers there were when its batch was made, and the size of the batch."""
-
-
 class State(NamedTuple):
     """The belief after some answers."""
 
     laplace: Laplace
-    eta: np.ndarray
-    """(S, p)"""
+    w: np.ndarray
+    """(S, p): samples of the weights."""
     lapse: np.ndarray
     """(S,)"""
+    mean: np.ndarray
+    """(p,): the weights to use now."""
 
 
 def state_after(answers: list[Answer], options: Options, belief: Belief) -> State:
@@ -63,7 +50,9 @@ def state_after(answers: list[Answer], options: Options, belief: Belief) -> Stat
             f"least curvature {laplace.curvature:.1e}"
         )
     rng = options.rng(len(answers), 0)
-    return State(laplace, *belief.draws(laplace, gap, labels, options.samples, rng))
+    eta, lapse = belief.draws(laplace, gap, labels, options.samples, rng)
+    chart = belief.chart
+    return State(laplace, chart.weights(eta), lapse, chart.mean_weights(eta))
 
 
 def gaps(answers: list[Answer], belief: Belief) -> np.ndarray:
@@ -117,7 +106,7 @@ def _repeated(
     answers: list[Answer], number: int, original: int, state: State, belief: Belief
 ) -> Question:
     old = answers[original]
-    z = belief.chart.weights(state.eta) @ -gaps([old], belief).T
+    z = state.w @ -gaps([old], belief).T
     question = _question(
         old.question.second, old.question.first, probability(z, state.lapse)[:, 0], number
     )
@@ -179,7 +168,7 @@ def _candidates(
     shown = _shown(state, options, belief, rng)
     features = belief.features(shown.trajectories)
     first, second = shown.pairs
-    costs = belief.chart.weights(state.eta) @ features.T
+    costs = state.w @ features.T
     P = probability(costs[:, second] - costs[:, first], state.lapse)
     gap = features[second] - features[first]
     allowed = (np.abs(gap) > 1e-9 * np.abs(features[first])).any(axis=1)
@@ -197,7 +186,7 @@ def _shown(state: State, options: Options, belief: Belief, rng: np.random.Genera
         pool = check_pool(options.pool(rng)) if callable(options.pool) else options.pool
         return pool_shown(pool, rng)
     x0 = options.states.draw(STATES, rng)
-    models = belief.features.model(state.eta[:CONTROLLERS])
+    models = belief.features.model(state.w[:CONTROLLERS])
     return loops_shown(options.loops, models, x0, rng)
 
 

@@ -29,7 +29,7 @@ from prefmpc.asking.loops import loops_of
 from prefmpc.asking.sources import States, check_pool
 from prefmpc.learning.priors import WishartPrior, bryson, free_entries
 from prefmpc.models.separable import SeparableCost
-from prefmpc.preferences.trajectories import Trajectory
+from prefmpc.preferences.trajectories import Trajectory, rollout
 from prefmpc.systems.linear import LinearSystem, System
 from prefmpc.systems.sets import Polyhedron
 
@@ -69,14 +69,17 @@ class Options:
         self.coupling = positive("coupling", self.coupling)
         for name in ("steps", "horizon", "samples"):
             setattr(self, name, positive_int(name, getattr(self, name)))
-        if self.repeat_every != 0:
+        if not (is_whole(self.repeat_every) and self.repeat_every == 0):
             self.repeat_every = positive_int("repeat_every", self.repeat_every)
         if isinstance(self.lapse, str):
             choice("lapse", self.lapse, ("estimate",))
-        elif not nonnegative("lapse", self.lapse) < 1:
-            raise ValueError(f'lapse must lie in [0, 1) or be "estimate", got {self.lapse}')
+        else:
+            self.lapse = nonnegative("lapse", self.lapse)
+            if self.lapse >= 1:
+                raise ValueError(f'lapse must lie in [0, 1) or be "estimate", got {self.lapse}')
         self._check_sources()
-        self.prior = self._default_prior() if self.prior is None else self.prior
+        if self.prior is None:
+            self.prior = self._default_prior()
         self.features = self._features()
         self._check_stabilisable()
         self.loops = loops_of(
@@ -113,16 +116,34 @@ class Options:
         self.states = States(self.x0, self.system.nx, self.constraints)
 
     def _default_prior(self) -> WishartPrior:
-        """Return Bryson's rule: x(0) at its largest, or what a pool shows, and the input limits."""
-        reach = self.states.size()
+        """Return Bryson's rule with what the responses reach: those of a pool, or of a first guess.
+
+        The first guess is the LQR of Bryson's rule with the largest x(0) and the input limits.
+        """
         force = np.minimum(-self.system.u_min, self.system.u_max)
+        size = self.states.size()
         if isinstance(self.pool, Trajectory):
             reach = np.abs(self.pool.x).max((0, 1))
             force = np.where(np.isfinite(force), force, np.abs(self.pool.u).max((0, 1)))
-        if reach is None or not (reach > 0).all() or not (np.isfinite(force) & (force > 0)).all():
+        elif (
+            isinstance(self.system, LinearSystem) and size is not None and np.isfinite(force).all()
+        ):
+            guess = np.divide(1.0, size**2, out=np.zeros_like(size), where=size > 0)
+            with np.errstate(divide="ignore"):
+                R = np.diag(1 / force**2)
+            K, _ = self.system.lqr(np.diag(guess), R)
+            x0 = self.states.draw(64, np.random.default_rng(0))
+            runs = rollout(self.system, x0, K, self.steps, saturate=True)
+            reach = np.abs(runs.x).max((0, 1))
+        else:
+            reach = np.zeros(self.system.nx)
+        if (
+            not (np.isfinite(reach) & (reach > 0)).all()
+            or not (np.isfinite(force) & (force > 0)).all()
+        ):
             raise ValueError(
-                "prior must be given (bryson makes one) unless x0 says how large each state may "
-                "be, and the system's limits how large each input"
+                "prior must be given (bryson makes one) unless x0 and the input limits, or a pool, "
+                "say how large each state and input may be"
             )
         return bryson(reach, force)
 

@@ -7,11 +7,12 @@ import dataclasses
 import numpy as np
 
 from prefmpc._checks import nonnegative, share
+from prefmpc.asking.loops import STATES
 from prefmpc.asking.options import Options
+from prefmpc.asking.questions import Question
 
 JUDGED = 100
-"""So many samples of the posterior say what the regret may be, from so many x(0):"""
-FROM = 16
+"""So many samples of the posterior say what the regret may be."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -65,19 +66,30 @@ class Consistency:
     first: float
 
 
-def regret_of(eta: np.ndarray, samples: np.ndarray, options: Options) -> Regret:
-    """Return the regret of the controller of η (p,) over samples (S, p) of the posterior.
+def regret_of(present: np.ndarray, samples: np.ndarray, options: Options) -> Regret:
+    """Return the regret of the controller of weights w (p,) over samples (S, p) of the posterior.
 
     The x(0) are a function of the key alone, and the same for all.
     """
     features, samples = options.features, samples[:JUDGED]
-    x0 = options.states.draw(FROM, options.rng(0, 2))
-    runs = options.loops(features.model(np.concatenate([eta[None], samples])), x0)
+    x0 = options.states.draw(STATES, options.rng(0, 2))
+    runs = options.loops(features.model(np.concatenate([present[None], samples])), x0)
     phi = np.asarray(features(runs))  # (1 + S, m, p)
-    finite = np.isfinite(phi).all(axis=(0, 2))
-    if not finite.any():
-        raise ValueError("x0 must hold a state from which every controller reaches the end")
-    mean = phi[:, finite].mean(axis=1)
-    w = features.chart.weights(samples)
-    costs = w @ mean.T  # (S, 1 + S): saturated, a sample's own LQR need not be the best for it
-    return Regret(costs[:, 0] / costs.min(axis=1) - 1)
+    reached = np.isfinite(phi[0]).all(axis=-1)
+    if not reached.any():
+        raise ValueError("x0 must hold a state from which the present controller reaches the end")
+    costs = samples @ phi[:, reached].mean(axis=1).T
+    # Saturated, a sample's own LQR need not be the best for it; who fails is not.
+    return Regret(costs[:, 0] / np.nanmin(costs, axis=1) - 1)
+
+
+def consistency_of(questions: list[Question], labels: np.ndarray) -> Consistency:
+    """Return what the repeated questions say; labels (n,) with NaN for skipped ones."""
+    pairs = [(labels[i], 1 - labels[q.repeats]) for i, q in enumerate(questions) if q.repeated]
+    pairs = [pair for pair in pairs if not np.isnan(pair).any()]
+    known = labels[~np.isnan(labels)]
+    return Consistency(
+        repeats=len(pairs),
+        equal=float(np.mean([1 - abs(a - b) for a, b in pairs])) if pairs else np.nan,
+        first=float(known.mean()) if known.size else np.nan,
+    )

@@ -8,16 +8,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from prefmpc._checks import finite_array, instance
+from prefmpc._checks import finite_array, function, instance
 from prefmpc.asking.loops import Loops, finite_loops
 from prefmpc.asking.questions import pairs_of
 from prefmpc.preferences.pools import random_states
 from prefmpc.preferences.trajectories import Trajectory, failed
 from prefmpc.systems.sets import Polyhedron
-
-STATES = 12
-CONTROLLERS = 12
-"""So many x(0) and so many samples of the posterior make the closed loops of one question."""
 
 MOST_PAIRS = 4000
 
@@ -41,6 +37,7 @@ class States:
             self._rows = Polyhedron(constraints.H[about_x][:, :nx], constraints.h[about_x])
         self.given: Any
         if callable(x0):
+            function("x0", x0, 2)
             self.given = x0
         else:
             self.given = np.asarray(finite_array("x0", x0))
