@@ -69,6 +69,9 @@ class Tape:
         size = np.broadcast(low, high).shape if size is None else size
         return low + (np.asarray(high) - low) * self._kept(self._rng.uniform(size=size))
 
+    def choice(self, n: int, size: int, p: np.ndarray) -> np.ndarray:
+        return np.searchsorted(np.cumsum(p), self.uniform(size=size), side="right")
+
     def _kept(self, values: np.ndarray) -> np.ndarray:
         self.numbers += np.ravel(values).tolist()
         return values

@@ -4,17 +4,21 @@
 // the first of two trajectories with P = ε/2 + (1 − ε)·logistic(z), z = σ(second) − σ(first).
 // A set of answers is {gap (n, p): features of the second minus those of the first,
 // labels (n): P(first preferred)}.
+//
+// What all log weights have in common is how sharp the answers are. Laplace's method is applied
+// for each of several sharpnesses ("levels"), which are then weighed by their evidence.
 (function (ask) {
   "use strict";
-  const { cholesky, dot, eigen, eye, multiply, solve, times, transpose, zeros } = ask.linalg;
+  const { dot, eigen, eye, times, transpose, zeros } = ask.linalg;
   const { normals, uniforms } = ask.random;
 
   const LAPSE_CENTRE = Math.log(0.04 / 0.96);
   const LAPSE_SPREAD = 1; // an estimated lapse rate has a logit of this mean and deviation
+  const LEVELS = Array.from({ length: 13 }, (_, i) => (i - 6) / 2); // in deviations of the prior's
   const STEPS = 100;
   const TOLERANCE = 1e-9; // of the certificate; the search itself goes on to
   const POLISHED = 1e-18;
-  const FLOOR = 1e-3;
+  const FLAT = 1e-3; // no curvature counts as less than this share of the prior's
   const ROUNDS = 30;
 
   const logistic = (z) => (z >= 0 ? 1 / (1 + Math.exp(-z)) : Math.exp(z) / (1 + Math.exp(z)));
@@ -34,33 +38,60 @@
     };
   }
 
-  // The posterior of η for a prior {spread, sharpness} and a lapse rate, or "estimate".
+  // The belief for a prior {spread, sharpness} and a lapse rate, or "estimate": η = level·common
+  // + basis·v with a standard Gaussian v; an estimated lapse rate is one more coordinate.
   function belief(p, prior, lapse) {
-    const own = prior.spread ** 2, common = prior.sharpness ** 2;
-    const covariance = zeros(p, p).map((row, i) => row.map((_, j) => common + (i === j ? own : 0)));
-    const unit = cholesky(covariance), precision = solve(covariance, eye(p));
-    return { p, lapse, unit, precision };
+    const common = Math.hypot(prior.sharpness, prior.spread / Math.sqrt(p));
+    // The reflection that turns (1, …, 1) into the first axis: its other rows are orthogonal to it.
+    const v = new Array(p).fill(1 / (1 + Math.sqrt(p))), scale = (Math.sqrt(p) + 1) / Math.sqrt(p);
+    v[0] = 1;
+    const basis = zeros(p, p - 1).map((row, i) => row.map((_, j) =>
+      prior.spread * ((i === j + 1 ? 1 : 0) - scale * v[i] * v[j + 1])));
+    return { p, lapse, common, basis };
   }
 
-  // The Gaussian about the most probable η. With ε > 0 the search starts from the solution for
-  // ε = 0, that one from the centre of the prior, so that the result depends on the answers alone.
-  function fit(b, answers) {
-    const plain = newton(b, new Array(b.p).fill(0), answers, 0);
-    if (b.lapse === 0) return plain;
-    if (b.lapse === "estimate") return newton(b, [...plain.eta, LAPSE_CENTRE], answers, null);
-    return newton(b, plain.eta, answers, b.lapse);
-  }
-
-  // −log posterior up to a constant, at η, and the logit of the lapse rate if `lapse` is null.
-  function energy(b, at, answers, lapse) {
-    const { gap, labels } = answers, p = b.p, w = new Array(p);
-    let total = 0;
-    for (let i = 0; i < p; i++) {
-      w[i] = Math.exp(at[i]);
-      for (let j = 0; j < p; j++) total += 0.5 * at[i] * b.precision[i][j] * at[j];
+  function etaOf(b, at, level) {
+    const eta = new Array(b.p);
+    for (let i = 0; i < b.p; i++) {
+      eta[i] = level * b.common;
+      for (let j = 0; j < b.p - 1; j++) eta[i] += b.basis[i][j] * at[j];
     }
-    if (lapse === null) total += 0.5 * ((at[p] - LAPSE_CENTRE) / LAPSE_SPREAD) ** 2;
-    const rate = lapse === null ? logistic(at[p]) : lapse;
+    return eta;
+  }
+
+  const rateOf = (at) => logistic(LAPSE_CENTRE + LAPSE_SPREAD * at[at.length - 1]);
+
+  // The Gaussians about the most probable points, one a level: centres `at` (K, q), roots of the
+  // covariances (K, q, q), and how probable each level is. The search starts where answers say
+  // next to nothing and follows the minimum from level to level, first without lapses, so that
+  // the result depends on the answers alone.
+  function fit(b, answers) {
+    let at = new Array(b.p - 1).fill(0);
+    const minima = LEVELS.map((level) => {
+      const plain = newton(b, at, level, answers, 0);
+      at = plain.at;
+      if (b.lapse === 0) return plain;
+      if (b.lapse === "estimate") return newton(b, [...at, 0], level, answers, null);
+      return newton(b, at, level, answers, b.lapse);
+    });
+    const evidence = minima.map((minimum) => minimum.evidence), most = Math.max(...evidence);
+    const shares = evidence.map((e) => Math.exp(e - most));
+    const total = shares.reduce((sum, share) => sum + share, 0);
+    const k = evidence.indexOf(most), best = minima[k];
+    return {
+      eta: etaOf(b, best.at, LEVELS[k]), lapse: b.lapse === "estimate" ? rateOf(best.at) : b.lapse,
+      decrement: best.decrement, curvature: best.curvature,
+      success: best.decrement <= TOLERANCE && best.curvature > 0,
+      at: minima.map((m) => m.at), roots: minima.map((m) => m.root),
+      weights: shares.map((share) => share / total),
+    };
+  }
+
+  // −log posterior up to a constant; the lapse rate is a coordinate if `lapse` is null.
+  function energy(b, at, level, answers, lapse) {
+    const { gap, labels } = answers, w = etaOf(b, at, level).map(Math.exp);
+    const rate = lapse === null ? rateOf(at) : lapse;
+    let total = 0.5 * dot(at, at);
     for (let i = 0; i < gap.length; i++) {
       const z = dot(gap[i], w);
       total += rate === 0 ? softplus(z) - labels[i] * z : lapsing(z, labels[i], rate).loss;
@@ -68,93 +99,106 @@
     return Number.isFinite(total) ? total : Infinity;
   }
 
-  function slopes(b, at, answers, lapse) {
-    const { gap, labels } = answers, p = b.p, eta = at.slice(0, p), w = eta.map(Math.exp);
-    const rate = lapse === null ? logistic(at[p]) : lapse;
-    const gradient = times(b.precision, eta), hessian = b.precision.map((row) => row.slice());
-    const side = new Array(p).fill(0), total = [0, 0];
+  function slopes(b, at, level, answers, lapse) {
+    const { gap, labels } = answers, n = b.p - 1, w = etaOf(b, at, level).map(Math.exp);
+    const rate = lapse === null ? rateOf(at) : lapse;
+    const gradient = at.slice(), hessian = eye(at.length), total = [0, 0];
+    const bend = new Array(b.p).fill(0), side = new Array(n).fill(0);
     for (let i = 0; i < gap.length; i++) {
-      const z = dot(gap[i], w);
-      let [slope, curvature, byRate] = [0, 0, [0, 0, 0]];
-      if (lapse === 0) {
-        const s = logistic(z);
-        [slope, curvature] = [s - labels[i], s * (1 - s)];
-      } else {
-        ({ slope, curvature, byRate } = lapsing(z, labels[i], rate));
-      }
-      const toEta = gap[i].map((g, j) => g * w[j]);
-      for (let j = 0; j < p; j++) {
-        gradient[j] += slope * toEta[j];
-        side[j] += byRate[1] * toEta[j];
-        hessian[j][j] += slope * toEta[j];
-        for (let k = 0; k < p; k++) hessian[j][k] += curvature * toEta[j] * toEta[k];
+      const z = dot(gap[i], w), s = logistic(z);
+      const { slope, curvature, byRate } = lapse === 0
+        ? { slope: s - labels[i], curvature: s * (1 - s), byRate: [0, 0, 0] }
+        : lapsing(z, labels[i], rate);
+      const toEta = gap[i].map((g, j) => g * w[j]), toAt = new Array(n).fill(0);
+      toEta.forEach((g, j) => {
+        bend[j] += slope * g;
+        for (let k = 0; k < n; k++) toAt[k] += g * b.basis[j][k];
+      });
+      for (let j = 0; j < n; j++) {
+        gradient[j] += slope * toAt[j];
+        side[j] += byRate[1] * toAt[j];
+        for (let k = 0; k < n; k++) hessian[j][k] += curvature * toAt[j] * toAt[k];
       }
       total[0] += byRate[0];
       total[1] += byRate[2];
     }
+    b.basis.forEach((row, i) => row.forEach((one, j) => {
+      for (let k = 0; k < n; k++) hessian[j][k] += bend[i] * one * row[k];
+    }));
     if (lapse !== null) return { gradient, hessian };
-    const step = rate * (1 - rate), bend = step * (1 - 2 * rate);
-    gradient.push(step * total[0] + (at[p] - LAPSE_CENTRE) / LAPSE_SPREAD ** 2);
-    hessian.forEach((row, j) => row.push(step * side[j]));
-    const corner = step ** 2 * total[1] + bend * total[0] + 1 / LAPSE_SPREAD ** 2;
-    hessian.push([...side.map((s) => step * s), corner]);
+    const step = LAPSE_SPREAD * rate * (1 - rate);
+    gradient[n] += step * total[0];
+    hessian[n][n] += step ** 2 * total[1] + LAPSE_SPREAD * step * (1 - 2 * rate) * total[0];
+    side.forEach((value, j) => { hessian[n][j] = hessian[j][n] = step * value; });
     return { gradient, hessian };
   }
 
-  // Newton's method with directions of negative curvature turned, scaled so that the prior is a
-  // standard Gaussian. What it says of itself is the certificate: decrement and least curvature.
-  function newton(b, start, answers, lapse) {
-    const q = start.length, unit = eye(q);
-    b.unit.forEach((row, i) => row.forEach((value, j) => { unit[i][j] = value; }));
-    if (lapse === null) unit[q - 1][q - 1] = LAPSE_SPREAD;
-    const back = transpose(unit);
-    let at = start, now = energy(b, at, answers, lapse), values, vectors, decrement;
+  // Newton's method with directions of negative curvature turned. What it says of itself is the
+  // certificate: decrement and least curvature.
+  function newton(b, start, level, answers, lapse) {
+    let at = start, now = energy(b, at, level, answers, lapse), values, vectors, decrement;
     for (let step = 0; step < STEPS; step++) {
-      const { gradient, hessian } = slopes(b, at, answers, lapse);
-      ({ values, vectors } = eigen(multiply(back, multiply(hessian, unit))));
-      const turned = times(transpose(vectors), times(back, gradient));
-      const scaled = turned.map((g, i) => g / Math.max(Math.abs(values[i]), FLOOR));
+      const { gradient, hessian } = slopes(b, at, level, answers, lapse);
+      ({ values, vectors } = eigen(hessian));
+      const turned = times(transpose(vectors), gradient);
+      const scaled = turned.map((g, i) => g / Math.max(Math.abs(values[i]), FLAT));
       decrement = 0.5 * dot(turned, scaled);
       if (decrement <= POLISHED && values[0] > 0) break;
-      const inner = times(vectors, scaled), move = times(unit, inner);
-      let t = Math.min(1, 4 / (Math.max(...inner.map(Math.abs)) + 1e-300)), found = false;
-      for (let half = 0; half < 40 && !found; half++) {
+      const move = times(vectors, scaled);
+      let t = Math.min(1, 3 / Math.max(...move.map(Math.abs))), found = false;
+      for (; t > 1e-10 && !found; t /= 2) {
         const trial = at.map((value, i) => value - t * move[i]);
-        const level = energy(b, trial, answers, lapse);
-        found = level <= now - 0.2 * t * decrement + 1e-13 * Math.abs(now);
-        if (found) [at, now] = [trial, level];
-        else t /= 2;
+        const height = energy(b, trial, level, answers, lapse);
+        found = height <= now - 0.2 * t * decrement + 1e-13 * Math.abs(now);
+        if (found) [at, now] = [trial, height];
       }
       if (!found) break;
     }
-    const scale = values.map((value) => 1 / Math.sqrt(Math.max(value, FLOOR)));
-    const root = multiply(unit, vectors.map((row) => row.map((v, i) => v * scale[i])));
+    const size = values.map((value) => Math.max(value, FLAT));
+    const evidence = -now - 0.5 * size.reduce((sum, s) => sum + Math.log(s), 0) - 0.5 * level ** 2;
     return {
-      eta: at.slice(0, b.p), at, root, decrement: Number.isFinite(now) ? decrement : Infinity,
-      curvature: values[0], lapse: lapse === null ? logistic(at[q - 1]) : lapse,
-      success: decrement <= TOLERANCE && values[0] > 0,
+      at, evidence, decrement: Number.isFinite(now) ? decrement : Infinity, curvature: values[0],
+      root: vectors.map((row) => row.map((value, i) => value / Math.sqrt(size[i]))),
     };
   }
 
-  // Samples of the posterior: elliptical slice sampling about Laplace's Gaussian, all chains at
-  // once. Each starts from a draw of the Gaussian and is moved `slices` times.
+  // Samples of the posterior: elliptical slice sampling about Laplace's Gaussians, all chains at
+  // once. Each starts from a draw and is moved `slices` times at its level.
   function draws(b, laplace, answers, count, slices, source) {
-    const q = laplace.at.length, lapse = q === b.p ? b.lapse : null;
-    const place = (x) => times(laplace.root, x).map((value, i) => laplace.at[i] + value);
-    const excess = (x) => 0.5 * dot(x, x) - energy(b, place(x), answers, lapse);
-    const x = normals(source, count, q), level = slices ? x.map(excess) : [];
-    for (let k = 0; k < slices; k++) slice(x, level, excess, source);
-    const at = x.map(place);
+    const q = laplace.at[0].length, lapse = q === b.p - 1 ? b.lapse : null;
+    const which = uniforms(source, count).map((u) => chosen(laplace.weights, u));
+    const x = normals(source, count, q);
+    const point = (x, i) => times(laplace.roots[which[i]], x).map((v, j) => laplace.at[which[i]][j] + v);
+    const excess = (x, i) =>
+      0.5 * dot(x, x) - energy(b, point(x, i), LEVELS[which[i]], answers, lapse);
+    const height = slices ? x.map(excess) : [];
+    for (let k = 0; k < slices; k++) slice(x, height, excess, source);
+    const at = x.map(point);
     return {
-      eta: at.map((point) => point.slice(0, b.p)),
-      lapse: at.map((point) => (lapse === null ? logistic(point[b.p]) : lapse)),
+      eta: at.map((place, i) => etaOf(b, place, LEVELS[which[i]])),
+      lapse: at.map((place) => (lapse === null ? rateOf(place) : lapse)),
     };
+  }
+
+  // The first index at which the sum of the weights so far is above u.
+  function chosen(weights, u) {
+    let sum = 0;
+    const k = weights.findIndex((weight) => (sum += weight) > u);
+    return k < 0 ? weights.length - 1 : k;
+  }
+
+  // The mean of weights of equal sharpness. Sharpness is the mean of the log weights; that of the
+  // mean is its own mean.
+  function meanWeights(etas) {
+    const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
+    const sharpness = etas.map(mean), all = Math.exp(mean(sharpness));
+    return etas[0].map((_, j) => all * mean(etas.map((eta, m) => Math.exp(eta[j] - sharpness[m]))));
   }
 
   // Move every chain once, in place (Murray, Adams and MacKay 2010).
-  function slice(x, level, excess, source) {
+  function slice(x, height, excess, source) {
     const count = x.length, other = normals(source, count, x[0].length);
-    const floor = uniforms(source, count).map((r, i) => level[i] + Math.log(r));
+    const floor = uniforms(source, count).map((r, i) => height[i] + Math.log(r));
     const angle = uniforms(source, count).map((r) => 2 * Math.PI * r);
     const low = angle.map((a) => a - 2 * Math.PI), high = angle.slice(), from = x.slice();
     let open = x.map((_, i) => i);
@@ -162,9 +206,9 @@
       open = open.filter((i) => {
         const c = Math.cos(angle[i]), s = Math.sin(angle[i]);
         const trial = from[i].map((value, j) => c * value + s * other[i][j]);
-        const value = excess(trial);
+        const value = excess(trial, i);
         if (!(value >= floor[i])) return true;
-        [x[i], level[i]] = [trial, value];
+        [x[i], height[i]] = [trial, value];
         return false;
       });
       for (const i of open) {
@@ -175,5 +219,5 @@
     }
   }
 
-  ask.belief = { belief, fit, draws, logistic };
+  ask.belief = { belief, draws, fit, logistic, meanWeights };
 })(globalThis.prefmpcAsk = globalThis.prefmpcAsk || {});

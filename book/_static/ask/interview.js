@@ -10,7 +10,7 @@
 (function (ask) {
   "use strict";
   const { quantile } = ask.linalg;
-  const { features, weights } = ask.plant;
+  const { features } = ask.plant;
   const { random } = ask.random;
 
   const FORMAT = 1;
@@ -19,11 +19,10 @@
   const DEFAULTS = Object.freeze({
     spread: 2, sharpness: 2, coupling: 0.5, steps: 20, lapse: 0, repeatEvery: 8,
     samples: 150, // draws from the posterior, each moved so often:
-    slices: 8,
+    slices: 5,
     controllers: 12, // so many of them make loops, from so many states, for one question
     states: 12,
-    judged: 100, // so many say what the regret may be, from so many states
-    from: 16,
+    judged: 100, // so many say what the regret may be, from as many states
     level: 0.02, // enough: the regret is at most this with this probability,
     certain: 0.9,
     patience: 1, // after so many answers in a row
@@ -43,7 +42,7 @@
     const key = lines.length ? lines[0].key : [given.seed ?? ask.random.seed()];
     const source = (count, purpose) => random(...key, count, purpose);
     const belief = ask.belief.belief(options.centre.length, options, options.lapse);
-    const x0 = ask.random.states(source(0, STATES), options.radius, options.from);
+    const x0 = ask.random.states(source(0, STATES), options.radius, options.states);
     const kept = new Map();
 
     // What follows from the first n answers, or compute it. The last two are kept.
@@ -61,7 +60,9 @@
       const laplace = ask.belief.fit(belief, known);
       if (!laplace.success) throw new Error("no most probable weights were found");
       const { samples, slices } = options, rng = source(n, SAMPLES);
-      return { laplace, samples: ask.belief.draws(belief, laplace, known, samples, slices, rng) };
+      const { eta, lapse } = ask.belief.draws(belief, laplace, known, samples, slices, rng);
+      const w = eta.map((log) => log.map(Math.exp));
+      return { samples: { w, lapse }, mean: ask.belief.meanWeights(eta) };
     });
 
     const question = () => once("question", answers.length, () => {
@@ -70,26 +71,26 @@
     });
 
     const regret = (n) => once("regret", n, () => {
-      const { laplace, samples } = state(n), judged = samples.eta.slice(0, options.judged);
-      return ask.questions.regret(config, options, laplace.eta, judged, x0);
+      const { mean, samples } = state(n), judged = samples.w.slice(0, options.judged);
+      return ask.questions.regret(config, options, mean, judged, x0);
     });
 
     const bound = (n) => quantile(regret(n), options.certain);
 
     function progress() {
-      const n = answers.length, { laplace, samples } = state(n);
+      const n = answers.length, { mean, samples } = state(n);
       const last = Array.from({ length: options.patience }, (_, i) => n - i);
       return {
         count: n, bound: bound(n), median: quantile(regret(n), 0.5), level: options.level,
         most: options.most, certain: options.certain, enough: last.every((i) => i >= 0 && bound(i) <= options.level),
-        weights: shares(config, options.centre, laplace.eta, samples.eta),
+        weights: shares(config, options.centre, mean, samples.w),
         consistency: consistency(answers),
       };
     }
 
     function trial(count) {
-      const rng = source(answers.length, TRIAL), { eta } = state(answers.length).laplace;
-      const gains = [eta, eta.map(() => 0)].map((at) => ask.plant.gainOf(config, options.centre, at));
+      const rng = source(answers.length, TRIAL), { mean } = state(answers.length);
+      const gains = [mean, mean.map(() => 1)].map((w) => ask.plant.gainOf(config, options.centre, w));
       return ask.random.states(rng, options.radius, count).map((start) => {
         const loops = gains.map((K) => ask.plant.loop(config, K, start, options.steps));
         const learned = rng.uniform() < 0.5 ? "first" : "second";
@@ -137,13 +138,16 @@
 
   // Each weight, and how far it is from the centre's, with an interval of 90 %: relative to the
   // common factor of all, which no controller depends on.
-  function shares(config, centre, eta, samples) {
-    const relative = (at) => at.map((v) => v - at.reduce((sum, w) => sum + w, 0) / at.length);
-    const own = relative(eta), others = samples.map(relative);
+  function shares(config, centre, mean, samples) {
+    const relative = (w) => {
+      const logs = w.map(Math.log);
+      return logs.map((log) => log - logs.reduce((sum, other) => sum + other, 0) / logs.length);
+    };
+    const own = relative(mean), others = samples.map(relative);
     return [...config.states, ...config.inputs].map(({ name, unit }, i) => {
-      const column = others.map((at) => at[i]);
+      const column = others.map((logs) => logs[i]);
       return {
-        name, unit, weight: weights(centre, eta)[i], ratio: Math.exp(own[i]),
+        name, unit, weight: mean[i] * centre[i], ratio: Math.exp(own[i]),
         low: Math.exp(quantile(column, 0.05)), high: Math.exp(quantile(column, 0.95)),
       };
     });

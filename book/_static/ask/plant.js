@@ -27,13 +27,10 @@
     return largest(miss) < RICCATI * largest(P) ? K : null;
   }
 
-  // Weights of a diagonal σ: `centre` (p) times e^η, first those of x, then those of u.
-  const weights = (centre, eta) => centre.map((c, i) => c * Math.exp(eta[i]));
-
-  // The gain of the LQR with the weights of η.
-  function gainOf(plant, centre, eta) {
-    const w = weights(centre, eta), n = plant.A.length;
-    return gain(plant, diag(w.slice(0, n)), diag(w.slice(n)));
+  // The gain of the LQR with weights w (p) in units of the centre's, first of x, then of u.
+  function gainOf(plant, centre, w) {
+    const own = w.map((weight, i) => weight * centre[i]), n = plant.A.length;
+    return gain(plant, diag(own.slice(0, n)), diag(own.slice(n)));
   }
 
   // The closed loop of u = clip(−K x): states x_0 … x_N, inputs and outputs of steps 0 … N − 1.
@@ -87,5 +84,5 @@
     });
   }
 
-  ask.plant = { gain, gainOf, weights, loop, loopFeatures, features };
+  ask.plant = { gain, gainOf, loop, loopFeatures, features };
 })(globalThis.prefmpcAsk = globalThis.prefmpcAsk || {});

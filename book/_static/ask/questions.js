@@ -22,14 +22,14 @@
   // The probabilities (one a sample) that the first is preferred; gap: features of the second
   // minus those of the first.
   const probabilities = (gap, samples) =>
-    samples.eta.map((eta, s) => probability(dot(gap, eta.map(Math.exp)), samples.lapse[s]));
+    samples.w.map((w, s) => probability(dot(gap, w), samples.lapse[s]));
 
-  // What σ sees of the closed loops of the controllers η from states x0: all that end, each with
+  // What σ sees of the closed loops of the controllers w from states x0: all that end, each with
   // its gain and its start, so that it can be shown.
-  function candidates(plant, centre, etas, x0, steps) {
+  function candidates(plant, centre, controllers, x0, steps) {
     const found = [];
-    etas.forEach((eta, source) => {
-      const K = gainOf(plant, centre, eta);
+    controllers.forEach((w, source) => {
+      const K = gainOf(plant, centre, w);
       if (K === null) return;
       loopFeatures(plant, K, centre, x0, steps).forEach((phi, start) => {
         if (phi.every(Number.isFinite)) found.push({ phi, start, source, K });
@@ -51,10 +51,7 @@
 
   // The information gain of each pair; −1 if its two loops are the same.
   function gains(found, chosen, samples) {
-    const costs = samples.eta.map((eta) => {
-      const w = eta.map(Math.exp);
-      return found.map((candidate) => dot(w, candidate.phi));
-    });
+    const costs = samples.w.map((w) => found.map((candidate) => dot(w, candidate.phi)));
     const count = costs.length;
     return chosen.map(([i, j]) => {
       const one = found[i].phi, other = found[j].phi;
@@ -96,8 +93,8 @@
       return question(second, first, P, number, again);
     }
     const x0 = ask.random.states(source, options.radius, options.states);
-    const etas = samples.eta.slice(0, options.controllers);
-    const found = candidates(plant, options.centre, etas, x0, options.steps);
+    const controllers = samples.w.slice(0, options.controllers);
+    const found = candidates(plant, options.centre, controllers, x0, options.steps);
     const all = pairs(found), scores = gains(found, all, samples);
     const best = scores.indexOf(Math.max(...scores));
     if (!(scores[best] >= 0)) throw new Error("no two closed loops from one start differ");
@@ -107,20 +104,21 @@
     return question(...sides, P, number, null);
   }
 
-  // For each sample: its own cost of the loops of η over that of the best controller, minus 1.
-  // (Saturated, a sample's own LQR need not be the best for it.)
-  function regret(plant, options, eta, samples, x0) {
-    const etas = [eta, ...samples];
-    const found = candidates(plant, options.centre, etas, x0, options.steps);
-    const loops = new Array(x0.length).fill(0);
-    for (const { start } of found) loops[start] += 1;
-    const phi = etas.map(() => new Array(eta.length).fill(0));
+  // For each sample: its own cost of the loops of the present weights over that of the best
+  // controller, minus 1. (Saturated, a sample's own LQR need not be the best for it.)
+  function regret(plant, options, present, samples, x0) {
+    const all = [present, ...samples];
+    const found = candidates(plant, options.centre, all, x0, options.steps);
+    const reached = new Set(found.filter((c) => c.source === 0).map((c) => c.start));
+    const phi = all.map(() => new Array(present.length).fill(0)), loops = all.map(() => 0);
     for (const candidate of found) {
-      if (loops[candidate.start] < etas.length) continue;
+      if (!reached.has(candidate.start)) continue;
+      loops[candidate.source] += 1;
       candidate.phi.forEach((value, i) => { phi[candidate.source][i] += value; });
     }
-    return samples.map((sample) => {
-      const w = sample.map(Math.exp), costs = phi.map((sums) => dot(w, sums));
+    const ended = phi.filter((_, i) => loops[i] === reached.size);
+    return samples.map((w) => {
+      const costs = ended.map((sums) => dot(w, sums));
       return costs[0] / Math.min(...costs) - 1;
     });
   }
