@@ -70,8 +70,9 @@ class Session:
         state, pair = rng.integers(0, 8, n), rng.integers(0, 8, (2, n))
         self.gap = (phi[pair[1], state] - phi[pair[0], state]).reshape(n, 8)
         w = np.exp(rng.normal(0, 1.5, 8))
-        self.labels = (self.gap @ w > rng.logistic(size=n)).astype(float)
-        self.labels[rng.uniform(size=n) < 0.1] = 0.5
+        z = self.gap @ w
+        self.labels = (z > rng.logistic(size=n)).astype(float)
+        self.labels[np.abs(z) < 0.2] = 0.5  # no difference is seen
 
     def given(self) -> dict[str, Any]:
         """Return what the page needs of it."""
@@ -102,10 +103,10 @@ def test_weights_and_their_deviations(sessions: list[tuple[Session, Any, Any]]) 
         np.testing.assert_allclose(found["eta"], laplace.eta, **CLOSE)
         np.testing.assert_allclose(found["lapse"], laplace.lapse, **CLOSE)
         np.testing.assert_allclose(found["curvature"], laplace.curvature, **CLOSE)
-        for name in ("at", "weights"):
-            np.testing.assert_allclose(found[name], getattr(laplace, name), **CLOSE)
-        # At sharpnesses that the answers all but exclude, rounding shows in the curvature.
+        np.testing.assert_allclose(found["weights"], laplace.weights, **CLOSE)
+        # At sharpnesses that the answers all but exclude, rounding may end the search.
         counts = laplace.weights > 1e-4
+        np.testing.assert_allclose(np.array(found["at"])[counts], laplace.at[counts], **CLOSE)
         ours, theirs = np.array(found["roots"])[counts], laplace.roots[counts]
         covariance = ours @ ours.swapaxes(1, 2), theirs @ theirs.swapaxes(1, 2)
         np.testing.assert_allclose(*covariance, **CLOSE)
