@@ -1,0 +1,240 @@
+"""A visitor of the page "Ask a person" in a Chromium without a network, by real clicks and keys."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from chromium import BROWSER, Browser
+
+from prefmpc import Interview, QuadraticCost, oscillating_masses, random_states
+from prefmpc.mpc import closed_loops
+from prefmpc.preferences.trajectories import phi
+
+if not BROWSER:
+    pytest.skip("no Chromium was found on the PATH", allow_module_level=True)
+
+PAGE = Path(__file__).resolve().parent.parent.parent / "_build" / "html" / "book" / "ask.html"
+SESSIONS = int(os.environ.get("PREFMPC_SESSIONS", "2"))
+# What the theme writes on every page of the book.
+OF_THE_THEME = ("[PST]", "[togglebutton]")
+
+WATCH = """
+  globalThis.visit = { questions: [], pressed: [], shifts: 0 };
+  const now = () => performance.now();
+  for (const kind of ["keydown", "click"]) {
+    addEventListener(kind, () => visit.pressed.push(now()), { capture: true });
+  }
+  addEventListener("ask-question", (event) => {
+    visit.question = event.detail;
+    visit.questions.push(now());
+  });
+  new PerformanceObserver((list) => {
+    for (const entry of list.getEntries()) visit.shifts += entry.value;
+  }).observe({ type: "layout-shift", buffered: true });
+"""
+
+WISH = """(() => {
+  const weights = [40, 40, 40, 5, 5, 5, 0.2, 0.2];
+  const [left, right] = [visit.question.first, visit.question.second].map(({ x, u }) =>
+    u.reduce((sum, inputs, k) => sum + [...x[k], ...inputs].reduce(
+      (part, value, i) => part + weights[i] * value ** 2, 0), 0));
+  return left <= right;
+})()"""
+
+FRAMES = """new Promise((done) => {
+  const times = [];
+  const step = (now) => {
+    times.push(now);
+    times.length > 120 ? done(times) : requestAnimationFrame(step);
+  };
+  requestAnimationFrame(step);
+})"""
+
+
+@pytest.fixture
+def browser() -> Iterator[Browser]:
+    with Browser() as browser:
+        yield visited(browser)
+
+
+def visited(browser: Browser, before: str = "") -> Browser:
+    browser.call("Page.addScriptToEvaluateOnNewDocument", source=before + WATCH)
+    browser.open(PAGE.as_uri())
+    browser.wait("visit.questions.length > 0")
+    return browser
+
+
+def count(browser: Browser) -> str:
+    return str(browser("document.querySelector('.ask-count').textContent"))
+
+
+def answer(browser: Browser, by_key: bool) -> None:
+    """Answer as the paper's weights would, and wait for what comes next."""
+    before, left = count(browser), browser(WISH)
+    if by_key:
+        browser.press("ArrowLeft" if left else "ArrowRight")
+    else:
+        browser.click(f'[data-answer="{"first" if left else "second"}"]')
+    browser.until(lambda: count(browser) != before, "another question")
+
+
+def over(browser: Browser) -> bool:
+    return bool(browser("!document.querySelector('.ask-over').hidden"))
+
+
+def told(browser: Browser) -> list[str]:
+    return [m for m in browser.messages if not m.startswith(OF_THE_THEME)]
+
+
+def extra_cost(path: Path) -> float:
+    """Return φ₃₀ of the MPC with the learned weights over that of the MPC that knows them, − 1."""
+    jax.config.update("jax_enable_x64", True)
+    system, Q, R = oscillating_masses(), np.diag([40.0] * 3 + [5.0] * 3), 0.2 * np.eye(2)
+    radius = np.array([0.3] * 3 + [0.05] * 3)
+    x0 = random_states(radius, key=np.random.default_rng(0), shape=(200,))
+
+    def total(model: Any) -> float:
+        loops = closed_loops(system, model, x0, horizon=10, steps=30)
+        return float(phi(loops.trajectories, Q, R).sum())
+
+    return total(Interview.load(path, append=False).model) / total(QuadraticCost(Q, R)) - 1
+
+
+def a_session() -> tuple[float, int, dict[str, Any]]:
+    """Return the extra cost, how many pairs of the blind test were won, and the times in ms."""
+    with Browser() as browser:
+        visited(browser)
+        for number in range(20):
+            answer(browser, by_key=number % 2 == 0)
+            if over(browser):
+                break
+        if not over(browser):
+            browser.click(".ask-stop")
+            browser.until(lambda: over(browser), "the end")
+        times = browser("""(() => {
+          const paint = performance.getEntriesByName("first-contentful-paint")[0].startTime;
+          const waits = visit.pressed.map((t) => visit.questions.find((q) => q > t) - t);
+          return { first: visit.questions[0] - paint, waits: waits.filter((w) => w < 5000) };
+        })()""")
+        browser.click(".ask-test")
+        browser.until(lambda: count(browser).startswith("Pair 1 "), "the blind test")
+        for number in range(10):
+            answer(browser, by_key=number % 2 == 0)
+        text = browser("document.querySelector('.ask-over').textContent")
+        wins = int(text.split("chose the learned one ")[1].split(" ")[0])
+        browser.click(".ask-save")
+        file = browser.downloads / "answers.jsonl"
+        browser.until(file.is_file, "the download")
+        assert told(browser) == []
+        assert [r for r in browser.requests if not r.startswith(("file:", "data:", "blob:"))] == []
+        assert browser("visit.shifts") < 0.02
+        return extra_cost(file), wins, times
+
+
+def test_a_visitor_gets_a_good_controller() -> None:
+    """At most 20 answers, then the blind test; the times are also those of a busy machine."""
+    costs, wins, times = zip(*(a_session() for _ in range(SESSIONS)), strict=True)
+    waits = np.concatenate([t["waits"] for t in times])
+    print(f"\nextra cost in %: {np.round(100 * np.array(costs), 2)}, wins of 10: {wins}")
+    print(f"ms to a question: {np.round(np.quantile(waits, [0.5, 0.9, 1]))}")
+    print(f"ms from first paint to first question: {[round(t['first']) for t in times]}")
+    assert np.mean(np.array(costs) < 0.02) >= 0.9
+    assert np.mean(wins) >= 8
+    assert np.median(waits) < 150
+    assert min(t["first"] for t in times) < 1000
+
+
+def test_it_moves_smoothly(browser: Browser) -> None:
+    browser.click(".ask-again")
+    steps = np.diff(browser(FRAMES))
+    print(f"\n{(steps > 25).mean():.0%} of {len(steps)} frames dropped")
+    assert np.median(steps) < 20
+    assert (steps > 25).mean() < 0.2
+
+
+def test_keys_alone(browser: Browser) -> None:
+    browser.press("ArrowDown")
+    browser.until(lambda: count(browser) == "Question 2", "no difference")
+    browser.press("ArrowRight")
+    browser.until(lambda: count(browser) == "Question 3", "the right one")
+    seen = browser("JSON.stringify(visit.question)")
+    browser.press("ArrowLeft")
+    browser.until(lambda: count(browser) == "Question 4", "the left one")
+    browser.press("Backspace")
+    browser.until(lambda: count(browser) == "Question 3", "undo")
+    assert browser("JSON.stringify(visit.question)") == seen
+    browser("document.querySelector('.ask-stage').focus()")
+    reached = []
+    for _ in range(10):
+        browser.press("Tab")
+        reached.append(browser("document.activeElement.textContent.trim()"))
+    for name in ("Repeat", "No difference", "Undo", "What I think you weigh", "Stop and test me"):
+        assert any(name in text for text in reached), (name, reached)
+    labels = browser(
+        "JSON.parse(localStorage['prefmpc: oscillating masses']).log.split('\\n').length"
+    )
+    assert labels == 4  # the head, two answers, and what comes after the last line
+
+
+def test_a_reload_loses_nothing_and_forgetting_forgets(browser: Browser) -> None:
+    for key in ("ArrowRight", "ArrowLeft", "ArrowDown"):
+        browser.press(key)
+        browser.until(lambda: not browser("document.querySelector('.ask-undo').disabled"), "undo")
+    browser.until(lambda: count(browser) == "Question 4", "three answers")
+    seen = browser("JSON.stringify(visit.question)")
+    browser.open(PAGE.as_uri())
+    browser.wait("visit.questions.length > 0")
+    assert count(browser) == "Question 4"
+    assert browser("JSON.stringify(visit.question)") == seen
+    browser.click(".ask-forget")
+    browser.until(lambda: count(browser) == "Question 1", "a new beginning")
+    browser.open(PAGE.as_uri())
+    browser.wait("visit.questions.length > 0")
+    assert count(browser) == "Question 1"
+    assert told(browser) == []
+
+
+def test_a_simulated_visitor_can_be_watched(browser: Browser) -> None:
+    browser.press("ArrowLeft")
+    browser.until(lambda: count(browser) == "Question 2", "an answer")
+    browser.click(".ask-visit")
+    browser.until(lambda: count(browser) == "Question 3", "two answers of the visitor", 30)
+    browser.click(".ask-visit")
+    browser.until(lambda: count(browser) == "Question 2", "one's own session again")
+    assert told(browser) == []
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_it_fits_the_window(width: int, scheme: str) -> None:
+    with Browser(width, 900, prefers_color_scheme=scheme, prefers_reduced_motion="reduce") as page:
+        visited(page)
+        assert page("document.documentElement.scrollWidth") <= width
+        assert page("document.documentElement.dataset.theme") == scheme
+        answer(page, by_key=False)
+        assert page("visit.shifts") < 0.02
+        # Nothing moves by itself: the whole response is there at once.
+        assert page("document.querySelector('.ask-toggle').textContent") == "Play again"
+        low = page(
+            "[...document.querySelectorAll('.ask-button, .ask-choose')].filter((b) =>"
+            " b.offsetParent && b.getBoundingClientRect().height < 38).length"
+        )
+        assert low == 0
+        assert told(page) == []
+
+
+def test_without_local_storage() -> None:
+    broken = """
+      Object.defineProperty(Storage.prototype, "setItem", { value() { throw new Error(); } });
+      Object.defineProperty(Storage.prototype, "getItem", { value: () => "{ no JSON" });
+    """
+    with Browser() as browser:
+        visited(browser, broken)
+        answer(browser, by_key=True)
+        assert count(browser) == "Question 2"

@@ -1,0 +1,310 @@
+"""The page "Ask a person": its arithmetic is the library's."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("py_mini_racer")
+
+from ask_page import SCRIPTS, Page, Tape
+
+from prefmpc import Interview, QuadraticPreference, WishartPrior, oscillating_masses
+from prefmpc.asking import belief, loops, questions, regret, sources
+from prefmpc.asking.belief import Belief, Prior
+from prefmpc.asking.making import RECENT
+from prefmpc.asking.options import Options
+from prefmpc.preferences.trajectories import Trajectory
+
+SYSTEM = oscillating_masses()
+STEPS = 20
+X0 = np.array([0.3, 0.3, 0.3, 0.05, 0.05, 0.05])
+CENTRE = np.array([1 / 0.3**2] * 6 + [1.0, 1.0])
+PRIOR = WishartPrior(np.diag(CENTRE[:6]), np.diag(CENTRE[6:]))
+PERSON = np.array([40.0] * 3 + [5.0] * 3 + [0.2] * 2)
+SESSIONS = 50
+CLOSE = {"rtol": 1e-8, "atol": 1e-8}
+
+
+@pytest.fixture(scope="module")
+def page() -> Iterator[Page]:
+    page = Page()
+    yield page
+    page.close()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _to_the_last_digit() -> Iterator[None]:
+    """Let the library go on, as the page does, when its certificate is good enough."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(belief, "TOLERANCE", 1e-18)
+        yield
+
+
+def options(**given: Any) -> Options:
+    defaults = {
+        name: parameter.default
+        for name, parameter in inspect.signature(Interview).parameters.items()
+        if name not in ("log", "self")
+    }
+    return Options(**{**defaults, "system": SYSTEM, "prior": PRIOR, "x0": X0, "key": 0, **given})
+
+
+class Session:
+    """Random answers to random pairs of closed loops, of somebody with random weights."""
+
+    def __init__(self, seed: int) -> None:
+        rng = np.random.default_rng(seed)
+        self.rng, self.options = rng, options()
+        self.lapse = (0.0, 0.05, None)[seed % 3]
+        self.prior = Prior(rng.uniform(0.5, 2.5), rng.uniform(0, 2.5), 0.5)
+        self.belief = Belief(self.options.features, self.prior, self.lapse)
+        n, x0 = int(rng.integers(0, 30)), rng.uniform(-X0, X0, (8, 6))
+        runs = self.options.loops(self.options.features.model(np.exp(rng.normal(0, 2, (8, 8)))), x0)
+        phi = self.options.features(runs)  # (8 controllers, 8 states, p)
+        state, pair = rng.integers(0, 8, n), rng.integers(0, 8, (2, n))
+        self.gap = (phi[pair[1], state] - phi[pair[0], state]).reshape(n, 8)
+        w = np.exp(rng.normal(0, 1.5, 8))
+        z = self.gap @ w
+        self.labels = (z > rng.logistic(size=n)).astype(float)
+        self.labels[np.abs(z) < 0.2] = 0.5  # no difference is seen
+
+    def given(self) -> dict[str, Any]:
+        """Return what the page needs of it."""
+        return {
+            "prior": vars(self.prior),
+            "lapse": "estimate" if self.lapse is None else self.lapse,
+            "answers": {"gap": self.gap, "labels": self.labels},
+        }
+
+
+FIT = "{ const b = ask.belief.belief(8, prior, lapse); return ask.belief.fit(b, answers); }"
+
+
+@pytest.fixture(scope="module")
+def sessions(page: Page) -> list[tuple[Session, Any, Any]]:
+    out = []
+    for seed in range(SESSIONS):
+        session = Session(seed)
+        laplace = session.belief.fit(session.gap, session.labels)
+        out.append((session, laplace, page(FIT, **session.given())))
+    return out
+
+
+def test_weights_and_their_deviations(sessions: list[tuple[Session, Any, Any]]) -> None:
+    for _, laplace, found in sessions:
+        assert found["success"]
+        assert laplace.success or laplace.decrement < 1e-12
+        np.testing.assert_allclose(found["eta"], laplace.eta, **CLOSE)
+        np.testing.assert_allclose(found["lapse"], laplace.lapse, **CLOSE)
+        np.testing.assert_allclose(found["curvature"], laplace.curvature, **CLOSE)
+        # At sharpnesses that the answers all but exclude, rounding decides where a search ends.
+        counts = laplace.weights > 1e-4
+        odds = [np.array(weights)[counts] for weights in (found["weights"], laplace.weights)]
+        np.testing.assert_allclose(*(weights / weights.max() for weights in odds), **CLOSE)
+        np.testing.assert_allclose(np.array(found["at"])[counts], laplace.at[counts], **CLOSE)
+        ours, theirs = np.array(found["roots"])[counts], laplace.roots[counts]
+        covariance = ours @ ours.swapaxes(1, 2), theirs @ theirs.swapaxes(1, 2)
+        np.testing.assert_allclose(*covariance, **CLOSE)
+
+
+def test_gains_and_closed_loops(page: Page, sessions: list[tuple[Session, Any, Any]]) -> None:
+    code = """{
+      const plant = ask.masses(), K = ask.plant.gainOf(plant, centre, w);
+      return [K, x0.map((start) => ask.plant.loop(plant, K, start, 20)),
+              ask.plant.loopFeatures(plant, K, centre, x0, 20)];
+    }"""
+    for session, laplace, _ in sessions:
+        w = np.exp(laplace.eta)
+        model = session.options.features.model(w[None])
+        x0 = session.rng.uniform(-2 * X0, 2 * X0, (3, 6))
+        K, found, phi = page(code, centre=CENTRE, w=w, x0=x0)
+        np.testing.assert_allclose(K, loops.gains(SYSTEM, model.Q, model.R)[0], **CLOSE)
+        wanted = loops.lqr_loops(SYSTEM, model, x0, STEPS)
+        for i, loop in enumerate(found):
+            for name in ("x", "u", "y"):
+                np.testing.assert_allclose(loop[name], getattr(wanted, name)[0, i], **CLOSE)
+        np.testing.assert_allclose(phi, session.options.features(wanted)[0], **CLOSE)
+
+
+def test_samples_from_the_same_random_numbers(
+    page: Page, sessions: list[tuple[Session, Any, Any]]
+) -> None:
+    code = """{
+      const b = ask.belief.belief(8, prior, lapse);
+      const found = ask.belief.draws(b, {at, roots, weights}, answers, 6, slices, tape(numbers));
+      return {...found, mean: ask.belief.meanWeights(found.eta)};
+    }"""
+    for seed, (session, laplace, _) in enumerate(sessions):
+        numbers: Any = Tape(seed)
+        eta, lapse = session.belief.draws(laplace, session.gap, session.labels, 6, numbers)
+        given = {name: getattr(laplace, name) for name in ("at", "roots", "weights")}
+        found = page(
+            code, slices=belief.SLICES, numbers=numbers.numbers, **given, **session.given()
+        )
+        np.testing.assert_allclose(found["eta"], eta, **CLOSE)
+        np.testing.assert_allclose(found["lapse"], lapse, **CLOSE)
+        np.testing.assert_allclose(found["mean"], session.belief.chart.mean_weights(eta), **CLOSE)
+
+
+def test_information_and_regret(page: Page, sessions: list[tuple[Session, Any, Any]]) -> None:
+    code = """{
+      const plant = ask.masses(), q = ask.questions;
+      const found = q.candidates(plant, centre, w.slice(0, 4), x0, 20), all = q.pairs(found);
+      return [all, q.gains(found, all, {w, lapse}),
+              q.regret(plant, {centre, steps: 20}, mean, w, x0)];
+    }"""
+    for session, laplace, _ in sessions[::5]:
+        rng, setup = session.rng, session.options
+        eta, lapse = session.belief.draws(laplace, session.gap, session.labels, 10, rng)
+        w, mean = np.exp(eta), session.belief.chart.mean_weights(eta)
+        x0 = setup.states.draw(loops.STATES, setup.rng(0, 2))
+        shown = sources.loops_shown(setup.loops, setup.features.model(w[:4]), x0, rng)
+        cost = w @ setup.features(shown.trajectories).T
+        P = questions.probability(cost[:, shown.pairs[1]] - cost[:, shown.pairs[0]], lapse)
+        given = {"centre": CENTRE, "w": w, "lapse": lapse, "x0": x0, "mean": mean}
+        all_pairs, gain, values = page(code, **given)
+        assert np.array_equal(np.transpose(all_pairs), shown.pairs)
+        np.testing.assert_allclose(gain, questions.information(P), **CLOSE)
+        np.testing.assert_allclose(values, regret.regret_of(mean, w, setup).values, **CLOSE)
+
+
+def test_it_is_the_same_plant_with_the_same_numbers(page: Page) -> None:
+    plant = page("ask.masses()")
+    for name, value in {"A": SYSTEM.A, "B": SYSTEM.B, "C": SYSTEM.C, "x0": X0}.items():
+        assert np.array_equal(plant[name], value)
+    assert (plant["uMin"], plant["uMax"]) == (SYSTEM.u_min.tolist(), SYSTEM.u_max.tolist())
+    np.testing.assert_allclose(plant["centre"]["Q"] + plant["centre"]["R"], CENTRE, rtol=1e-15)
+
+    ours = page("ask.interview.DEFAULTS")
+    library = inspect.signature(Interview).parameters
+    for name, theirs in {"repeatEvery": "repeat_every", **{k: k for k in ours}}.items():
+        if theirs in library:
+            assert ours[name] == library[theirs].default, name
+    level = inspect.signature(Interview.finished).parameters
+    assert (ours["level"], ours["certain"]) == (level["level"].default, level["q"].default)
+    assert ours["slices"] == belief.SLICES
+    assert (ours["controllers"], ours["states"]) == (loops.CONTROLLERS, loops.STATES)
+    assert ours["judged"] == regret.JUDGED
+    assert f"RECENT = {RECENT};" in (SCRIPTS / "questions.js").read_text(encoding="utf-8")
+
+
+SESSION = """
+  const plant = ask.masses(), person = ask.blind.visitor({person});
+  const page = ask.interview.interviewer(plant, {{seed: {seed}}});
+  for (let n = 0; n < {count}; n++) {{
+    const question = await page.next();
+    const wish = await person(question);
+    await page.answer(n === 3 ? 0.5 : n === 5 ? "skip" : wish);
+    if (n === 8) await page.undo();
+  }}
+  const log = await page.log(), again = ask.interview.interviewer(plant, {{log}});
+  const [one, other] = [await page.next(), await again.next()];
+  return {{ log, same: JSON.stringify(one) === JSON.stringify(other),
+           progress: await page.progress(), trial: await page.trial(10) }};
+"""
+
+
+def session(page: Page, seed: int, count: int = 20) -> Any:
+    return page.wait(SESSION.format(person=PERSON.tolist(), seed=seed, count=count))
+
+
+def test_the_library_resumes_what_the_page_has_written(page: Page, tmp_path: Path) -> None:
+    done = session(page, 1)
+    assert done["same"], "a reload asks another question"
+    path = tmp_path / "answers.jsonl"
+    path.write_text(done["log"], encoding="utf-8")
+    interview = Interview.load(path)
+    assert len(interview) == 19
+    labels = interview.labels
+    assert labels[3] == 0.5
+    assert np.isnan(labels[5])
+    repeats = [q.repeats for q in interview.questions]
+    assert [n for n, of in enumerate(repeats) if of is not None] == [7, 15]
+    for n in (7, 15):
+        again, before = interview.questions[n], interview.questions[repeats[n]]
+        assert np.array_equal(again.first.x, before.second.x)
+    assert alike(done["progress"], interview)
+    # The same visitor by the library, from the same trajectories.
+    said = QuadraticPreference(np.diag(PERSON[:6]), np.diag(PERSON[6:]))
+    data = interview.comparisons
+    clear = data.labels != 0.5
+    assert np.array_equal(said(*data.pairs)[clear], data.labels[clear])
+    interview.answer("first")  # appended to the same file
+    assert len(path.read_text(encoding="utf-8").splitlines()) == 21
+
+
+def test_the_page_reads_what_the_library_has_written(page: Page, tmp_path: Path) -> None:
+    path = tmp_path / "answers.jsonl"
+    interview = Interview(SYSTEM, PRIOR, x0=X0, key=3, log=path)
+    interview.answer_with(QuadraticPreference(np.diag(PERSON[:6]), np.diag(PERSON[6:])), 9)
+    code = """const page = ask.interview.interviewer(ask.masses(), {{log: {log!r}}});
+      return await page.progress();"""
+    found = page.wait(code.format(log=path.read_text(encoding="utf-8")))
+    assert found["count"] == 9
+    assert alike(found, interview)
+
+
+def alike(progress: Any, interview: Interview) -> bool:
+    """Whether both would use the same weights, but for the random numbers of the samples.
+
+    Two means over samples differ by the samples' own spread over the root of their number.
+    """
+    weights = np.log([weight["weight"] for weight in progress["weights"]])
+    model: Any = interview.model
+    own = np.log([*np.diag(model.Q), *np.diag(model.R)])
+    everyone: Any = interview.posterior
+    diagonals = [np.diagonal(M, axis1=-2, axis2=-1) for M in (everyone.Q, everyone.R)]
+    spread = np.log(np.concatenate(diagonals, axis=-1))
+    spread = (spread - spread.mean(axis=1, keepdims=True)).std(axis=0)
+    gap = (weights - weights.mean()) - (own - own.mean())
+    return bool((np.abs(gap) < 6 * spread / np.sqrt(150)).all())
+
+
+def test_the_blind_test(page: Page) -> None:
+    pairs = session(page, 2, 12)["trial"]
+    assert len(pairs) == 10
+    assert {pair["learned"] for pair in pairs} == {"first", "second"}
+    for pair in pairs:
+        assert pair["first"]["x"][0] == pair["second"]["x"][0]
+    ways = page("[ask.blind.wilson(9, 10), ask.blind.wilson(0, 10), ask.blind.wilson(10, 10)]")
+    # Wilson (1927), as statsmodels' proportion_confint(..., method="wilson") gives it.
+    wanted = [[0.5958499732, 0.9821237869], [0.0, 0.2775327999], [0.7224672001, 1.0]]
+    np.testing.assert_allclose(ways, wanted, atol=1e-9)
+    code = "ask.blind.verdict(pairs, answers)"
+    given = {"pairs": [{"learned": "first"}] * 4, "answers": ["first", "second", 0.5, "first"]}
+    found = page(code, **given)
+    assert (found["wins"], found["count"], found["ties"]) == (2, 3, 1)
+
+
+def test_random_numbers(page: Page) -> None:
+    code = """{
+      const one = ask.random.random(7, 1), other = ask.random.random(7, 1);
+      const next = ask.random.random(7, 2);
+      return [ask.random.uniforms(one, 20000), ask.random.uniforms(other, 3),
+              ask.random.uniforms(next, 3), ask.random.normals(next, 1, 20000)[0]];
+    }"""
+    uniform, same, another, normal = map(np.array, page(code))
+    assert np.array_equal(uniform[:3], same)
+    assert not np.isclose(same, another).any()
+    assert 0 <= uniform.min() < uniform.max() < 1
+    counts = np.histogram(uniform, 20, (0, 1))[0]
+    assert ((counts - 1000) ** 2 / 1000).sum() < 45  # χ² with 19 degrees: 1 in 1000
+    assert abs(np.corrcoef(uniform[:-1], uniform[1:])[0, 1]) < 0.025
+    assert abs(normal.mean()) < 0.025
+    assert abs(normal.var() - 1) < 0.04
+    assert abs((np.abs(normal) < 1).mean() - 0.6827) < 0.012
+
+
+def test_trajectories_on_the_page_are_trajectories(page: Page) -> None:
+    code = "return (await ask.interview.interviewer(ask.masses(), {seed: 5}).next());"
+    question = page.wait(code)
+    first, second = (Trajectory(**question[side]) for side in ("first", "second"))
+    assert first.x.shape == (STEPS + 1, 6)
+    assert np.array_equal(first.x[0], second.x[0])
+    assert np.abs(first.u).max() <= 1
