@@ -214,7 +214,12 @@ def session(page: Page, seed: int, count: int = 20) -> Any:
     return page.wait(SESSION.format(person=PERSON.tolist(), seed=seed, count=count))
 
 
-def test_the_library_resumes_what_the_page_has_written(page: Page, tmp_path: Path) -> None:
+def test_the_library_resumes_what_the_page_has_written(
+    page: Page,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     done = session(page, 1)
     assert done["same"], "a reload asks another question"
     path = tmp_path / "answers.jsonl"
@@ -235,6 +240,9 @@ def test_the_library_resumes_what_the_page_has_written(page: Page, tmp_path: Pat
     data = interview.comparisons
     clear = data.labels != 0.5
     assert np.array_equal(said(*data.pairs)[clear], data.labels[clear])
+    monkeypatch.chdir(tmp_path)
+    exec(page("ask.masses().code"), {})  # what the page offers to be copied
+    assert "0" in capsys.readouterr().out
     interview.answer("first")  # appended to the same file
     assert len(path.read_text(encoding="utf-8").splitlines()) == 21
 

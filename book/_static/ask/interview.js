@@ -23,9 +23,8 @@
     controllers: 12, // so many of them make loops, from so many states, for one question
     states: 12,
     judged: 100, // so many say what the regret may be, from as many states
-    level: 0.02, // enough: the regret is at most this with this probability,
+    level: 0.02, // enough: the regret is at most this with this probability
     certain: 0.9,
-    patience: 1, // after so many answers in a row
     most: Infinity, // so many answers are as much as can be asked of anybody
   });
 
@@ -45,10 +44,9 @@
     const x0 = ask.random.states(source(0, STATES), options.radius, options.states);
     const kept = new Map();
 
-    // What follows from the first n answers, or compute it. The last two are kept.
+    // What follows from the answers so far, or compute it.
     function once(name, n, compute) {
-      const old = (count) => count > answers.length || count < answers.length - 1;
-      for (const count of kept.keys()) if (old(count)) kept.delete(count);
+      for (const count of kept.keys()) if (count !== n) kept.delete(count);
       if (!kept.has(n)) kept.set(n, {});
       const known = kept.get(n);
       if (!(name in known)) known[name] = compute();
@@ -79,10 +77,9 @@
 
     function progress() {
       const n = answers.length, { mean, samples } = state(n);
-      const last = Array.from({ length: options.patience }, (_, i) => n - i);
       return {
         count: n, bound: bound(n), median: quantile(regret(n), 0.5), level: options.level,
-        most: options.most, certain: options.certain, enough: last.every((i) => i >= 0 && bound(i) <= options.level),
+        most: options.most, certain: options.certain, enough: bound(n) <= options.level,
         weights: shares(config, options.centre, mean, samples.w),
         consistency: consistency(answers),
       };

@@ -37,8 +37,8 @@
       Q: [0.3, 0.3, 0.3, 0.3, 0.3, 0.3].map((largest) => 1 / largest ** 2),
       R: [1, 1],
     },
-    // A person slips now and then, and gets tired; the page must not stop on a lucky answer.
-    method: { lapse: 0.03, patience: 2, most: 30 },
+    // A person slips now and then, and gets tired.
+    method: { lapse: 0.03, most: 30 },
     states: [
       { name: "position of mass 1", unit: "1/m²" },
       { name: "position of mass 2", unit: "1/m²" },
