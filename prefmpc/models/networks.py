@@ -187,7 +187,7 @@ def soft_constraints(constraints: Polyhedron, weight: ArrayLike) -> ICNNCost:
     Added to another σ by `SumCost` it lets the constraints be broken, at a price for each unit of
     H z − h. If the weights exceed the multipliers of the same constraints made hard, the plan is
     the same as with hard ones wherever these can be met. With H = [I; −I] and h = 0 it is
-    Σ weight·|z|.
+    ``Σ weight·|z|``.
 
     Parameters
     ----------
