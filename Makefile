@@ -20,7 +20,7 @@ HTML := _build/html
 PYTEST := $(BIN)/python -m pytest -q
 # A fast test file of each part of the library; `malformed_inputs` calls everything public.
 QUICK := systems trajectories preferences comparisons pools models loss minimise plots files \
-	malformed_inputs convex_mpc terminal package notebooks spread_files
+	malformed_inputs interview convex_mpc terminal package notebooks spread_files
 
 # The first interpreter on the PATH that is recent enough; `make PYTHON=... book` overrides.
 RECENT := import sys; sys.exit(sys.version_info < (3, 11))
