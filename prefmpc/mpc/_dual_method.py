@@ -147,7 +147,7 @@ class _Row(NamedTuple):
 
 def _chosen(g: _Given, s: _State, radius: Any) -> _Row:
     """Return the row that was begun with or, if there is none, the worst of the first in order."""
-    rows = g.free + g.Y @ s.w
+    rows = g.free + s.w @ g.Y.T
     over, under = rows - g.upper, g.lower - rows
     beyond = jnp.maximum(over, under)
     violated = ~(s.held | s.spared) & (beyond > ROOM * (jnp.abs(g.free) + radius))
@@ -252,7 +252,7 @@ def _afresh(g: _Given, s: _State, skip: Any, limit: Any) -> _State:
     force = -(s.N @ w)
     for _ in range(2):
         force = force - s.N @ (w + force @ s.C)
-    rows = g.free + g.Y @ w
+    rows = g.free + w @ g.Y.T
     size = jnp.abs(g.free) + jnp.linalg.norm(w)
     broken = (jnp.maximum(rows - g.upper, g.lower - rows) > 10 * ROOM * size).any()
     again = broken & ~skip & ~s.infeasible & ~s.stuck & (s.count < limit)
@@ -269,10 +269,11 @@ def _found(g: _Given, end: _State) -> tuple[Any, Any, Any]:
     beyond its limits.
     """
     m, n = g.Y.shape
-    slots = jnp.arange(m)[:, None] == end.row  # a free one is no row's
-    multipliers = slots @ (end.sign * end.force)
-    rows = g.free + g.Y @ end.w
-    inputs, active, radius = g.Y[:n], slots[:n].any(-1), jnp.linalg.norm(end.w)
+    place = jnp.where(end.row >= 0, end.row, m)
+    multipliers = jnp.zeros(m + 1).at[place].add(end.sign * end.force)[:m]
+    rows = g.free + end.w @ g.Y.T
+    inputs, radius = g.Y[:n], jnp.linalg.norm(end.w)
+    active = (jnp.arange(n)[:, None] == end.row).any(-1)
     held = end.row >= 0
     miss = jnp.abs(end.C @ end.w - end.target)
     miss = jnp.where(held, miss + ROUNDING * (jnp.abs(end.target) + radius), 0.0)
