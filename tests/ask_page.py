@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from py_mini_racer import MiniRacer
 
-SCRIPTS = Path(__file__).resolve().parent.parent / "book" / "_static" / "ask"
+from prefmpc.asking.page import SOURCES as SCRIPTS
+
 ENGINE = ("linalg", "random", "plant", "belief", "questions", "interview", "blind", "masses")
 
 TAPE = """
