@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
 from typing import Any, Self
@@ -95,3 +96,49 @@ class Files:
         """Return the whole log, without what was taken back."""
         lines = [line_of(number, answer) for number, answer in enumerate(self._answers)]
         return b"".join(map(encoded, [self._options.stored(), *lines]))
+
+
+def resume(interview: Files, path: Any, needed: bool) -> int:
+    """Let an interview go on from its log, which it alone may write to from now on.
+
+    Parameters
+    ----------
+    path : path or None
+        A new file, that of an earlier session with the same interview, or None for the log that
+        the interview has.
+    needed : bool
+        Whether there must be a log.
+
+    Returns
+    -------
+    torn : int
+        Bytes of a torn last line, which was removed.
+    """
+    if path is None:
+        if needed and interview._log is None:
+            raise ValueError("log must be given if it is to say who answers, got None")
+        return 0 if interview._log is None else interview._log.hold()
+    if not isinstance(path, str | os.PathLike):
+        raise ValueError(f"log must be a path, got {type(path).__name__}")
+    if interview._log is not None:
+        own = interview._log.path
+        if os.path.realpath(own) != os.path.realpath(path):
+            raise ValueError(f"log must be {own}, the interview's own, got {path}")
+        return interview._log.hold()
+    if not os.path.lexists(path):
+        interview.save(path)
+    lines, size = read(path)
+    log = Log(path, size)
+    for name, value in json.loads(encoded(interview._options.stored())).items():
+        if lines[0].get(name) != value:
+            raise ValueError(f"log must be of this interview, but {path} has another {name}")
+    answers, batch = replayed(lines, path)
+    texts = [
+        [encoded(line_of(*a)) for a in enumerate(some)] for some in (answers, interview._answers)
+    ]
+    if texts[0][: len(texts[1])] != texts[1]:
+        raise ValueError(f"log must begin with the answers that the interview has, {path} does not")
+    torn = log.hold()
+    interview._log = log
+    interview._answers, interview._batch = answers, batch
+    return torn

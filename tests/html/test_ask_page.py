@@ -289,6 +289,7 @@ def test_a_file_of_its_own(tmp_path: Path, make: Any, width: int) -> None:
             before = count(page)
             page.press(("ArrowLeft", "ArrowRight", "ArrowDown")[number % 3])
             page.until(lambda before=before: count(page) != before, "another question")
+        assert page("visit.shifts") < 0.02
         page.open(path.as_uri())  # again: nothing is lost
         page.wait("visit.questions.length > 0")
         assert count(page) == "Question 7"
@@ -310,4 +311,3 @@ def test_a_file_of_its_own(tmp_path: Path, make: Any, width: int) -> None:
         assert {r for r in page.requests if not r.startswith("blob:")} == {path.as_uri()}
         page("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=\"spoiled = 1\">')")
         assert page("typeof spoiled") == "undefined"
-        assert page("visit.shifts") < 0.02
