@@ -10,7 +10,9 @@ from py_mini_racer import MiniRacer
 
 from prefmpc.asking.page import SOURCES as SCRIPTS
 
-ENGINE = ("linalg", "random", "plant", "belief", "questions", "interview", "blind", "masses")
+ENGINE = (
+    *("linalg", "random", "plant", "belief", "questions", "interview", "blind", "masses", "remote"),
+)
 
 TAPE = """
 globalThis.tape = (numbers) => {

@@ -7,7 +7,7 @@ import hashlib
 import inspect
 import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +30,7 @@ from prefmpc import (
 )
 from prefmpc.asking import belief, loops, questions, regret, sources
 from prefmpc.asking.belief import Belief, Prior
+from prefmpc.asking.desk import Desk
 from prefmpc.asking.making import RECENT
 from prefmpc.asking.options import Options
 from prefmpc.asking.page import SCRIPTS as SHARED
@@ -419,6 +420,70 @@ def test_a_file_is_replaced_on_demand_only(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=words):
             own_plant().to_html(path, overwrite=True, **{"units": ["m", "m/s", "N"], **wrong})
+
+
+# ---- an interviewer that lives in Python ----
+
+MODEL = """
+  globalThis.outbox = [];
+  globalThis.listeners = [];
+  globalThis.done = null;
+  globalThis.model = {
+    send: (message) => outbox.push(message),
+    on: (name, listener) => listeners.push(listener),
+    off: (name, listener) => listeners.splice(listeners.indexOf(listener), 1),
+  };
+"""
+
+
+def talk(page: Page, body: str, reply: Callable[[Any], Any]) -> Any:
+    """Run an asynchronous function of the interviewer `there` while Python replies to it."""
+    page("(() => {" + MODEL + " return 0; })()")
+    page(
+        "((async () => { const there = ask.remote.interviewer(model); " + body + "})()"
+        ".then((value) => { done = [value]; }, (error) => { done = error.message; }), 0)"
+    )
+    while page("done") is None:
+        for message in page("outbox.splice(0)"):
+            page("listeners.map((hear) => hear(reply))", reply=reply(message))
+    return page("done")
+
+
+def test_a_front_end_asks_python(page: Page) -> None:
+    interview, by_hand = own_plant(), own_plant()
+    desk = Desk(
+        interview, [{"name": name, "unit": ""} for name in ("x1", "x2", "u1")], 0.02, 0.9, 9
+    )
+    body = """
+      const person = ask.blind.visitor([9, 1, 0.3]), counts = [(await there.progress()).count];
+      for (let n = 0; n < 6; n++) {
+        const wish = await person(await there.next());
+        counts.push((await there.answer(wish)).count);
+      }
+      counts.push((await there.undo()).count);
+      // Another view of the same session answers: this one's answer is late.
+      const other = ask.remote.interviewer(model);
+      await other.next();
+      await other.answer("first");
+      counts.push((await there.answer("second")).count, (await there.answer(0.5)).count);
+      there.close();
+      return { counts, log: await other.log(), pairs: (await other.trial(10)).length,
+               left: listeners.length };
+    """
+    (done,) = talk(page, body, desk.reply)
+    assert done["counts"] == [0, 1, 2, 3, 4, 5, 6, 5, 6, 7]
+    assert (done["pairs"], done["left"]) == (10, 1)
+    by_hand.answer_with(QuadraticPreference(np.diag([9.0, 1.0]), [[0.3]]), 5)
+    labels = [*by_hand.labels, 1.0, 0.5]
+    assert interview.labels.tolist() == labels
+    assert len(done["log"].splitlines()) == 8
+
+
+def test_an_error_of_python_is_an_error_of_the_front_end(page: Page) -> None:
+    def broken(message: Any) -> Any:
+        return {"reply": message["id"], "error": "no space left"}
+
+    assert talk(page, "return there.answer('first');", broken) == "no space left"
 
 
 def test_the_book_loads_the_same_scripts_in_the_same_order() -> None:

@@ -15,6 +15,9 @@ from prefmpc.preferences.trajectories import Trajectory, failed
 TRIAL = 3
 """The purpose of the random numbers of a blind test; see `Options.rng`."""
 
+LONGEST = 400
+"""At most so many characters of an error are sent: it may quote what came."""
+
 LARGEST = 1e300
 """In the place of an infinite number, which JSON does not have."""
 
@@ -70,7 +73,7 @@ class Desk:
             said = (
                 str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
             )
-            return {"reply": name, "error": said}
+            return {"reply": name, "error": said[:LONGEST]}
 
     def _next(self, message: dict[str, Any]) -> Any:
         question = self.interview.next()

@@ -93,6 +93,7 @@ class Log:
             other.release()
         with self._locked() as file:
             self._held = os.fdopen(os.dup(file.fileno()), "r+b", buffering=0)
+            weakref.finalize(self, self._held.close)
             self._holders[place] = self
             torn = self._end - self._size
             file.truncate(self._size)

@@ -180,9 +180,11 @@ def picture(interview: Interview, config: dict[str, Any]) -> str:
                 value, t = (np.append(value, value[-1]), time) if held else (value, time[:-1])
                 steps = "steps-post" if held else "default"
                 axes[row, column].plot(
-                    t, value, colour, ls=style[colour], label=name, drawstyle=steps
+                    t, value, colour, ls=style[colour], label=_plain(name), drawstyle=steps
                 )
             axes[row, 0].set_ylabel(_plain(plot["label"]))
+            if plot["legend"]:
+                axes[row, 0].legend(fontsize="small")
         axes[-1, column].set_xlabel("time in s")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=80)
