@@ -9,6 +9,7 @@ import re
 import secrets
 import socket
 import stat
+import sys
 import time
 import zlib
 from collections.abc import Iterator
@@ -23,6 +24,7 @@ else:
     HAS_LOCKS = True
 
 _DAY = 86400.0  # seconds
+_FAR = 1 << 40  # Windows locks bytes: one where there are none, so that all can be read
 
 
 @contextlib.contextmanager
@@ -117,7 +119,22 @@ def _open_temporary(target: Path, mode: int, path: str | os.PathLike[str]) -> Bi
 
 def _locked(file: BinaryIO) -> bool:
     """Lock a new file, or say that someone who clears up was faster."""
-    if not HAS_LOCKS:
+    return not HAS_LOCKS or (try_lock(file) and os.path.exists(file.name))
+
+
+def try_lock(file: BinaryIO) -> bool:
+    """Lock an open file until it is closed or the process ends; False if somebody else has."""
+    if sys.platform == "win32":
+        import msvcrt
+
+        place = file.tell()
+        file.seek(_FAR)
+        try:
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        except OSError:
+            return False
+        finally:
+            file.seek(place)
         return True
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -125,7 +142,7 @@ def _locked(file: BinaryIO) -> bool:
         return False
     except OSError:  # a file system without locks: nobody gets one, and nobody clears up
         return True
-    return os.path.exists(file.name)
+    return True
 
 
 def _remove_leftovers(target: Path) -> None:

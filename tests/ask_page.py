@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from py_mini_racer import MiniRacer
 
-SCRIPTS = Path(__file__).resolve().parent.parent / "book" / "_static" / "ask"
-ENGINE = ("linalg", "random", "plant", "belief", "questions", "interview", "blind", "masses")
+from prefmpc.asking.page import SOURCES as SCRIPTS
+
+ENGINE = (
+    *("linalg", "random", "plant", "belief", "questions", "interview", "blind", "masses", "remote"),
+)
 
 TAPE = """
 globalThis.tape = (numbers) => {

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import inspect
+import tempfile
 from functools import cache
+from pathlib import Path
 
 import control
 import matplotlib.pyplot as plt
@@ -42,9 +44,29 @@ def unlogged(**options):
     return p.Interview(**options)
 
 
-unlogged.__signature__ = inspect.Signature(
-    [v for k, v in inspect.signature(p.Interview).parameters.items() if k != "log"]
-)
+def shown(**options):
+    with tempfile.TemporaryDirectory() as folder:
+        AN_INTERVIEW().to_html(Path(folder, "ask.html"), **options)
+
+
+def asked(**options):
+    return p.ask(**options)
+
+
+@cache
+def AN_INTERVIEW():
+    return p.Interview(SYSTEM, PRIOR, x0=np.ones(2), key=0, samples=20, steps=3)
+
+
+def without(function, *names):
+    """Return the signature of a function without some arguments: nothing is written here."""
+    kept = inspect.signature(function).parameters.items()
+    return inspect.Signature([value for name, value in kept if name not in names])
+
+
+unlogged.__signature__ = without(p.Interview, "log")
+asked.__signature__ = without(p.ask, "log", "who")
+shown.__signature__ = without(p.Interview.to_html, "self", "path")
 
 
 @cache
@@ -57,7 +79,8 @@ def valid_calls():
     nets = p.MLPCost.random([1.0, 1, 1], key=KEY, widths=(2,), shape=(2,))
     tracker = p.ReferenceTracker(p.LinearMPC(SYSTEM, COST, 3), [0.0, 0.0])
     nonlinear = p.NonlinearMPC(SYSTEM, COST, 3)
-    interview = p.Interview(SYSTEM, PRIOR, x0=np.ones(2), key=0, samples=20, steps=3)
+    interview = AN_INTERVIEW()
+    names = ["x1", "x2", "u1"]
     deviations = {"x_r": np.ones(2), "u_r": np.ones(1), "y_r": np.ones(2), "u_before": np.ones(1)}
     out = {
         # plants
@@ -281,6 +304,17 @@ def valid_calls():
         "Interview.answer": (interview.answer, {"value": "first"}),
         "Interview.answer_with": (interview.answer_with, {"preference": PERSON, "count": 1}),
         "Interview.finished": (interview.finished, {"level": 0.02, "q": 0.9, "least_gain": 0.0}),
+        "Interview.to_html": (
+            shown,
+            {"title": "Mine", "names": names, "units": names, "most": 30, "overwrite": False},
+        ),
+        "ask": (
+            asked,
+            {
+                **{"interview": interview, "names": names, "units": names, "draw": "() => null"},
+                **{"level": 0.02, "certain": 0.9, "most": 30},
+            },
+        ),
         # controllers
         "LinearMPC": (p.LinearMPC, {**MPC, "terminal": ingredients}),
         "LinearMPC.solve": (

@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import inspect
-from collections.abc import Iterator
+import json
+import re
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from bs4 import BeautifulSoup
 
 pytest.importorskip("py_mini_racer")
 
 from ask_page import SCRIPTS, Page, Tape
+from test_interview import same
 
-from prefmpc import Interview, QuadraticPreference, WishartPrior, oscillating_masses
+from prefmpc import (
+    Comparisons,
+    Interview,
+    LinearSystem,
+    QuadraticPreference,
+    WishartPrior,
+    oscillating_masses,
+)
 from prefmpc.asking import belief, loops, questions, regret, sources
 from prefmpc.asking.belief import Belief, Prior
+from prefmpc.asking.desk import Desk
 from prefmpc.asking.making import RECENT
 from prefmpc.asking.options import Options
+from prefmpc.asking.page import SCRIPTS as SHARED
 from prefmpc.preferences.trajectories import Trajectory
 
 SYSTEM = oscillating_masses()
@@ -307,6 +322,177 @@ def test_random_numbers(page: Page) -> None:
     assert abs(normal.mean()) < 0.025
     assert abs(normal.var() - 1) < 0.04
     assert abs((np.abs(normal) < 1).mean() - 0.6827) < 0.012
+
+
+# ---- files of their own ----
+
+HOSTILE = (
+    "</script><script>document.title = 1</script>",
+    "<!-- & \"speed\" '😀' ]]>",
+    "\u2028\ud800",
+)
+
+
+def held(path: Path) -> dict[str, Any]:
+    """Return the configuration that a file holds, as a browser reads it."""
+    soup = BeautifulSoup(path.read_text(encoding="utf-8"), "html.parser")
+    scripts = soup.find_all("script")
+    assert len(scripts) == 2
+    assert len(soup.find_all("style")) == 1
+    policy = str(soup.find("meta", attrs={"http-equiv": "Content-Security-Policy"})["content"])
+    assert policy.startswith("default-src 'none'; script-src 'sha256-")
+    assert "unsafe" not in policy
+    for tag in (scripts[1], soup.find("style")):
+        digest = hashlib.sha256(tag.string.encode()).digest()
+        assert f"'sha256-{base64.b64encode(digest).decode()}'" in policy
+    return json.loads(scripts[0].string)
+
+
+def own_plant(**given: Any) -> Interview:
+    cart = LinearSystem.from_continuous([[0, 1], [0, -0.1]], [[0], [1]], dt=0.1, u_max=1.0)
+    prior = WishartPrior(np.diag([1.0, 4.0]), np.eye(1))
+    return Interview(cart, prior, **{"x0": [1.0, 0.5], "key": 5, "steps": 12, **given})
+
+
+def test_a_file_goes_on_with_the_interview_and_its_answers_come_back(
+    page: Page, tmp_path: Path
+) -> None:
+    person = QuadraticPreference(np.diag([9.0, 1.0]), [[0.3]])
+    for x0 in ([1.0, 0.5], [[1.0, 0.0], [0.0, 0.5], [0.7, 0.2]]):
+        interview = own_plant(x0=x0, lapse=0.05)
+        interview.answer_with(person, 3)
+        path = tmp_path / "ask.html"
+        interview.to_html(path, title=HOSTILE[0], names=HOSTILE, units=HOSTILE, overwrite=True)
+        config = held(path)
+        assert tuple(state["name"] for state in config["states"]) == HOSTILE[:2]
+        assert config["uMin"] == [None]
+        code = f"""
+          const config = ask.plant.limited({json.dumps(config)});
+          const page = ask.interview.interviewer(config, {{ log: config.log }});
+          const person = ask.blind.visitor([9, 1, 0.3]);
+          for (let n = 0; n < 9; n++) await page.answer(await person(await page.next()));
+          return {{ log: await page.log(), progress: await page.progress(),
+                    trial: await page.trial(10) }};
+        """
+        done = page.wait(code)
+        (tmp_path / "answers.jsonl").write_text(done["log"], encoding="utf-8")
+        resumed = Interview.load(tmp_path / "answers.jsonl", append=False)
+        assert len(resumed) == 12
+        assert all(map(same, resumed.questions[:3], interview.questions))
+        assert vars(resumed._options).keys() == vars(interview._options).keys()
+        assert resumed._options.stored() == interview._options.stored()
+        assert alike(done["progress"], resumed)
+        data = Comparisons.load(tmp_path / "answers.jsonl")
+        assert np.array_equal(person(*data.pairs), data.labels)
+        assert {pair["first"]["x"][0][0] for pair in done["trial"]} <= (
+            {1.0, 0.0, 0.7} if np.ndim(x0) == 2 else {p["second"]["x"][0][0] for p in done["trial"]}
+        )
+
+
+@pytest.mark.parametrize(
+    ("given", "words"),
+    [
+        ({"structure": "full"}, "whose structure is"),
+        ({"controller": "mpc"}, "whose controller is"),
+        ({"choose": "eubo"}, "whose choose is"),
+        ({"x0": lambda rng, n: rng.uniform(size=(n, 2))}, "whose x0 is"),
+        ({"pool": lambda rng: None}, "whose pool is"),
+    ],
+)
+def test_what_a_file_cannot_do_is_named(tmp_path: Path, given: Any, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        own_plant(**given).to_html(tmp_path / "ask.html")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_is_replaced_on_demand_only(tmp_path: Path) -> None:
+    path = tmp_path / "ask.html"
+    own_plant().to_html(path)
+    with pytest.raises(FileExistsError, match="overwrite=True"):
+        own_plant().to_html(path)
+    for wrong, words in (
+        ({"title": " "}, "title must be a text"),
+        ({"names": ["a", "b"]}, "names must hold a text for each of 2 states and 1 inputs"),
+        ({"names": "abc"}, "names must be a sequence of texts"),
+        ({"units": [1, 2, 3]}, "units must hold a text"),
+        ({"names": list("abcde")}, "units must be one for each of 5 names"),
+        ({"most": 0}, "most must be a whole number"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            own_plant().to_html(path, overwrite=True, **{"units": ["m", "m/s", "N"], **wrong})
+
+
+# ---- an interviewer that lives in Python ----
+
+MODEL = """
+  globalThis.outbox = [];
+  globalThis.listeners = [];
+  globalThis.done = null;
+  globalThis.model = {
+    send: (message) => outbox.push(message),
+    on: (name, listener) => listeners.push(listener),
+    off: (name, listener) => listeners.splice(listeners.indexOf(listener), 1),
+  };
+"""
+
+
+def talk(page: Page, body: str, reply: Callable[[Any], Any]) -> Any:
+    """Run an asynchronous function of the interviewer `there` while Python replies to it."""
+    page("(() => {" + MODEL + " return 0; })()")
+    page(
+        "((async () => { const there = ask.remote.interviewer(model); " + body + "})()"
+        ".then((value) => { done = [value]; }, (error) => { done = error.message; }), 0)"
+    )
+    while page("done") is None:
+        for message in page("outbox.splice(0)"):
+            page("listeners.map((hear) => hear(reply))", reply=reply(message))
+    return page("done")
+
+
+def test_a_front_end_asks_python(page: Page) -> None:
+    interview, by_hand = own_plant(), own_plant()
+    desk = Desk(
+        interview, [{"name": name, "unit": ""} for name in ("x1", "x2", "u1")], 0.02, 0.9, 9
+    )
+    body = """
+      const person = ask.blind.visitor([9, 1, 0.3]), counts = [(await there.progress()).count];
+      for (let n = 0; n < 6; n++) {
+        const wish = await person(await there.next());
+        counts.push((await there.answer(wish)).count);
+      }
+      counts.push((await there.undo()).count);
+      // Another view of the same session answers: this one's answer is late.
+      const other = ask.remote.interviewer(model);
+      await other.next();
+      await other.answer("first");
+      counts.push((await there.answer("second")).count, (await there.answer(0.5)).count);
+      there.close();
+      return { counts, log: await other.log(), pairs: (await other.trial(10)).length,
+               left: listeners.length };
+    """
+    (done,) = talk(page, body, desk.reply)
+    assert done["counts"] == [0, 1, 2, 3, 4, 5, 6, 5, 6, 7]
+    assert (done["pairs"], done["left"]) == (10, 1)
+    by_hand.answer_with(QuadraticPreference(np.diag([9.0, 1.0]), [[0.3]]), 5)
+    labels = [*by_hand.labels, 1.0, 0.5]
+    assert interview.labels.tolist() == labels
+    assert len(done["log"].splitlines()) == 8
+
+
+def test_an_error_of_python_is_an_error_of_the_front_end(page: Page) -> None:
+    def broken(message: Any) -> Any:
+        return {"reply": message["id"], "error": "no space left"}
+
+    assert talk(page, "return there.answer('first');", broken) == "no space left"
+
+
+def test_the_book_loads_the_same_scripts_in_the_same_order() -> None:
+    text = (Path(__file__).parents[1] / "book" / "ask.md").read_text(encoding="utf-8")
+    named = re.findall(r"_static/ask/(\w+)\.js", text)
+    assert [name for name in named if name not in ("masses", "start")] == list(SHARED)
+    everything = "".join(path.read_text(encoding="utf-8") for path in SCRIPTS.iterdir())
+    assert "</" not in everything
+    assert "<!--" not in everything
 
 
 def test_trajectories_on_the_page_are_trajectories(page: Page) -> None:

@@ -46,7 +46,7 @@ def test_a_log_and_a_saved_file_resume_with_the_same_question(tmp_path, key):
     with pytest.raises(FileExistsError):
         interview.save(tmp_path / "saved")
     # In the middle of a batch: the rest of it, then as if nothing had happened.
-    resumed = Interview.load(tmp_path / "log")
+    resumed = Interview.load(tmp_path / "log", append=False)
     for each in (interview, resumed):
         each.answer_with(PERSON, 3)
     alike(resumed, interview)

@@ -253,7 +253,9 @@ def test_the_wheel_holds_the_library_and_no_studies():
     )
     built = {str(Path(line).relative_to("build/lib")) for line in listed.split()}
     there = {str(path.relative_to(ROOT.parent)) for path in ROOT.rglob("*.py")}
-    assert built == there | {"prefmpc/py.typed"}
+    scripts = {str(path.relative_to(ROOT.parent)) for path in ROOT.rglob("static/ask/*.*")}
+    assert built == there | scripts | {"prefmpc/py.typed"}
+    assert len(scripts) > 15
 
 
 def test_no_module_depends_on_itself():

@@ -8,8 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from prefmpc._checks import number
-from prefmpc.asking.log import trajectory_from
 from prefmpc.asking.questions import Question
+from prefmpc.preferences.comparisons import Comparisons, compared
+from prefmpc.preferences.logs import answers_of
 
 
 class Answer(NamedTuple):
@@ -38,6 +39,13 @@ def label_of(value: Any) -> float:
     )
 
 
+def comparisons_of(answers: list[Answer]) -> Comparisons:
+    """Return what was answered as a data set; a ValueError if nothing was."""
+    questions = [a.question for a in answers]
+    sides = [q.first for q in questions], [q.second for q in questions]
+    return compared(*sides, np.array([a.label for a in answers]))
+
+
 def line_of(count: int, answer: Answer) -> dict[str, Any]:
     """Return the line of a log for the answer to a question."""
     label = None if np.isnan(answer.label) else answer.label
@@ -49,31 +57,10 @@ def line_of(count: int, answer: Answer) -> dict[str, Any]:
     }
 
 
-def _from_line(line: dict[str, Any]) -> Answer:
-    stored = line["question"]
-    sides = {side: trajectory_from(stored[side]) for side in ("first", "second")}
-    label = float("nan") if line["answer"] is None else float(line["answer"])
-    start, size = line["batch"]
-    return Answer(Question(**{**stored, **sides}), label, (start, size))
-
-
 def replayed(
     lines: list[dict[str, Any]], path: str | os.PathLike[str]
 ) -> tuple[list[Answer], tuple[int, int]]:
     """Return the answers that the lines of a log leave, and the batch of the last line."""
-    answers: list[Answer] = []
-    batch = (0, 1)
-    for place, line in enumerate(lines, 2):
-        try:
-            if "undo" in line:
-                batch = answers.pop().batch
-                fits = len(answers) == line["undo"]
-            else:
-                fits = len(answers) == line["number"]
-                answers.append(_from_line(line))
-                batch = answers[-1].batch
-        except (KeyError, IndexError, TypeError, ValueError):
-            fits = False
-        if not fits:
-            raise ValueError(f"path must be a log, {path} makes no sense in line {place}")
-    return answers, batch
+    logged, last = answers_of(lines, path)
+    answers = [Answer(Question(**a.question), a.label, a.batch) for a in logged]
+    return answers, (0, 1) if last is None else last.batch

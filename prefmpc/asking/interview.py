@@ -5,16 +5,16 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 
 from prefmpc._checks import function, nonnegative, positive_int
-from prefmpc._files import atomic_write
-from prefmpc.asking.answers import Answer, label_of, line_of, replayed
+from prefmpc.asking.answers import Answer, comparisons_of, label_of, line_of
 from prefmpc.asking.belief import Laplace
 from prefmpc.asking.criteria import Criterion
-from prefmpc.asking.log import Log, encoded, read
+from prefmpc.asking.files import Files
+from prefmpc.asking.log import Log
 from prefmpc.asking.loops import Controller
 from prefmpc.asking.making import State, make, state_after
 from prefmpc.asking.options import Options
@@ -33,7 +33,7 @@ from prefmpc.systems.sets import Polyhedron
 Choose = Literal["information", "regret", "volume", "eubo", "random"] | Criterion
 
 
-class Interview:
+class Interview(Files):
     """Ask a person for one of two responses at a time until their σ is known well enough.
 
     The next question is made on purpose: closed loops of a dozen σ that the answers leave
@@ -186,6 +186,11 @@ class Interview:
     # What is known
 
     @property
+    def system(self) -> System:
+        """The plant."""
+        return self._options.system
+
+    @property
     def questions(self) -> list[Question]:
         """All questions so far, with those that were skipped."""
         return [answer.question for answer in self._answers]
@@ -198,13 +203,7 @@ class Interview:
     @property
     def comparisons(self) -> Comparisons:
         """The answers as a data set; a ValueError if there are none."""
-        answers = [a for a in self._answers if not np.isnan(a.label)]
-        if not answers:
-            raise ValueError("comparisons need at least one answer, there is none")
-        sides = [a.question.first for a in answers] + [a.question.second for a in answers]
-        n = len(answers)
-        labels = np.array([a.label for a in answers])
-        return Comparisons(stacked(sides), np.arange(n), np.arange(n, 2 * n), labels)
+        return comparisons_of(self._answers)
 
     @property
     def model(self) -> CostModel:
@@ -270,42 +269,6 @@ class Interview:
         if self.next().gain < least_gain:
             return f"the next question is worth less than {least_gain:g} nats"
         return None
-
-    # Files
-
-    def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the whole interview as a log, which `load` resumes."""
-        if not isinstance(path, str | os.PathLike):
-            raise ValueError(f"path must be a path, got {type(path).__name__}")
-        with atomic_write(path, overwrite=overwrite) as file:
-            file.write(encoded(self._options.stored()))
-            for number, answer in enumerate(self._answers):
-                file.write(encoded(line_of(number, answer)))
-
-    @classmethod
-    def load(cls, path: str | os.PathLike[str], *, append: bool = True, **functions: Any) -> Self:
-        """Resume an interview from its log: the same answers, and the same next question.
-
-        Parameters
-        ----------
-        path : path-like
-        append : bool
-            Go on writing to the same file.
-        **functions
-            Those of ``x0``, ``controller``, ``pool`` and ``choose`` that were functions, and a
-            ``system`` that is no `LinearSystem`: they cannot be stored.
-
-        Raises
-        ------
-        ValueError
-            If the file is no log, is damaged, or needs a function that is not given.
-        """
-        lines, size = read(path)
-        interview = cls(**Options.arguments(lines[0], functions))
-        interview._answers, interview._batch = replayed(lines[1:], path)
-        if append:
-            interview._log = Log(path, size)
-        return interview
 
     # Inside
 

@@ -24,16 +24,20 @@ from prefmpc._random import generator
 from prefmpc.asking.belief import Belief, Prior
 from prefmpc.asking.criteria import CRITERIA
 from prefmpc.asking.features import FeatureMap, QuadraticFeatures, SeparableFeatures
-from prefmpc.asking.log import FORMAT, to_json, trajectory_from
+from prefmpc.asking.log import to_json
 from prefmpc.asking.loops import loops_of
 from prefmpc.asking.sources import States, check_pool
 from prefmpc.learning.priors import WishartPrior, bryson, free_entries
 from prefmpc.models.separable import SeparableCost
+from prefmpc.preferences.logs import FORMAT
 from prefmpc.preferences.trajectories import Trajectory, rollout
 from prefmpc.systems.linear import LinearSystem, System
 from prefmpc.systems.sets import Polyhedron
 
 FUNCTIONS = ("x0", "controller", "pool", "choose")
+
+_OBJECTS = {"system": dict, "prior": dict, "constraints": dict | None, "pool": dict | None}
+"""What stands in a log for an argument that is an object."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -199,7 +203,13 @@ class Options:
     @classmethod
     def arguments(cls, line: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
         """Return the arguments of `Interview` from the head of a log, and what it cannot hold."""
-        out = {name: line[name] for name in (f.name for f in dataclasses.fields(cls))}
+        names = [field.name for field in dataclasses.fields(cls)]
+        if missing := [name for name in names if name not in line]:
+            raise ValueError(f"{missing[0]} is missing")
+        out = {name: line[name] for name in names}
+        for name, wanted in _OBJECTS.items():
+            if not isinstance(out[name], wanted):
+                raise ValueError(f"{name} must be an object, got {out[name]!r:.50}")
         needed = {name for name in FUNCTIONS if out[name] == {"function": True}}
         if "A" not in out["system"]:
             needed.add("system")
@@ -210,13 +220,12 @@ class Options:
             )
         out |= own
         if "system" not in own:
-            out["system"] = LinearSystem(**_arrays(out["system"]))
-        kind: Any = SeparableCost if "c" in out["prior"] else WishartPrior
-        out["prior"] = kind(**_arrays(out["prior"]))
+            out["system"] = _made(LinearSystem, "system", out)
+        out["prior"] = _made(SeparableCost if "c" in out["prior"] else WishartPrior, "prior", out)
         if out["constraints"] is not None:
-            out["constraints"] = Polyhedron(**_arrays(out["constraints"]))
+            out["constraints"] = _made(Polyhedron, "constraints", out)
         if isinstance(out["pool"], dict):
-            out["pool"] = trajectory_from(out["pool"])
+            out["pool"] = _made(Trajectory, "pool", out)
         return out
 
 
@@ -224,12 +233,17 @@ def _parts(value: Any, names: tuple[str, ...]) -> dict[str, Any]:
     return {name: getattr(value, name) for name in names if hasattr(value, name)}
 
 
-def _arrays(stored: dict[str, Any]) -> dict[str, Any]:
+def _made(kind: Any, name: str, line: dict[str, Any]) -> Any:
     """Return what `to_json` wrote: lists as arrays, infinite numbers in them as such."""
-    return {
-        name: np.array(value, dtype=np.float64) if isinstance(value, list) else value
-        for name, value in stored.items()
-    }
+    try:
+        return kind(
+            **{
+                part: np.array(value, dtype=np.float64) if isinstance(value, list) else value
+                for part, value in line[name].items()
+            }
+        )
+    except (TypeError, ValueError) as error:  # a field of another name, or of another kind
+        raise ValueError(f"{name}: {error}") from error
 
 
 def _words(key: Any) -> list[int]:

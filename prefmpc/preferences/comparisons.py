@@ -15,6 +15,7 @@ from prefmpc._checks import finite_array, flag, function, indices, positive_int
 from prefmpc._files import atomic_write
 from prefmpc._pytree import set_fields
 from prefmpc._random import generator
+from prefmpc.preferences.logs import answers_of, read
 from prefmpc.preferences.people import Preference, asked
 from prefmpc.preferences.trajectories import Trajectory, check_finite
 
@@ -213,7 +214,14 @@ class Comparisons:
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Comparisons:
-        """Read a file that `save` wrote; a ValueError says what is wrong with any other file."""
+        """Read a file that `save` wrote, or the log of an interview, which ends in ``.jsonl``.
+
+        A ValueError says what is wrong with any other file, of a log with line and field.
+        """
+        if Path(path).suffix == ".jsonl":
+            answers, _ = answers_of(read(path)[0], path)
+            first, second = ([a.question[side] for a in answers] for side in ("first", "second"))
+            return compared(first, second, np.array([a.label for a in answers]))
         try:
             with np.load(Path(path), allow_pickle=False) as file:
                 stored = {name: file[name] for name in file.files}
@@ -232,6 +240,17 @@ class Comparisons:
         optional = {name: stored[name] for name in _OPTIONAL if name in stored}
         trajectories = Trajectory(stored["x"], stored["u"], stored["y"], **optional)
         return cls(trajectories, stored["first"], stored["second"], stored["labels"])
+
+
+def compared(first: list[Trajectory], second: list[Trajectory], labels: np.ndarray) -> Comparisons:
+    """Return pairs of single trajectories as a data set without those that were skipped (NaN)."""
+    given = np.flatnonzero(~np.isnan(labels))
+    if not given.size:
+        raise ValueError("comparisons need at least one answer, there is none")
+    sides = [first[i] for i in given] + [second[i] for i in given]
+    both = jax.tree.map(lambda *leaves: np.stack(leaves), *sides)
+    n = given.size
+    return Comparisons(both, np.arange(n), np.arange(n, 2 * n), labels[given])
 
 
 def _recorded(side: str, x: ArrayLike, u: ArrayLike, y: ArrayLike | None) -> Trajectory:

@@ -12,7 +12,16 @@ import numpy as np
 import pytest
 from chromium import BROWSER, Browser
 
-from prefmpc import Interview, QuadraticCost, oscillating_masses, random_states
+from prefmpc import (
+    Comparisons,
+    Interview,
+    LinearSystem,
+    QuadraticCost,
+    bryson,
+    cart_pendulum,
+    oscillating_masses,
+    random_states,
+)
 from prefmpc.mpc import closed_loops
 from prefmpc.preferences.trajectories import phi
 
@@ -63,9 +72,9 @@ def browser() -> Iterator[Browser]:
         yield visited(browser)
 
 
-def visited(browser: Browser, before: str = "") -> Browser:
+def visited(browser: Browser, before: str = "", page: Path = PAGE) -> Browser:
     browser.call("Page.addScriptToEvaluateOnNewDocument", source=before + WATCH)
-    browser.open(PAGE.as_uri())
+    browser.open(page.as_uri())
     browser.wait("visit.questions.length > 0")
     return browser
 
@@ -238,3 +247,67 @@ def test_without_local_storage() -> None:
         visited(browser, broken)
         answer(browser, by_key=True)
         assert count(browser) == "Question 2"
+
+
+# ---- files of their own ----
+
+EVIL = "</script><script>document.title = 'spoiled'</script>", "\"speed\" & 'rate' 😀", "<b>u</b>"
+PENDULUM = "position", "angle", "speed", "angular speed", "force"
+PENDULUM_UNITS = "m", "rad", "m/s", "rad/s", "N"
+
+
+def of_the_pendulum() -> tuple[Interview, dict[str, Any]]:
+    plant = cart_pendulum().linearise(np.zeros(4), np.zeros(1))
+    prior = bryson([1, 0.3, 1, 1], [10])
+    interview = Interview(plant, prior, x0=[0.5, 0.1, 0.1, 0.1], steps=60, key=0)
+    return interview, {"names": PENDULUM, "units": PENDULUM_UNITS, "title": "The pendulum"}
+
+
+def of_my_own() -> tuple[Interview, dict[str, Any]]:
+    plant = LinearSystem.from_continuous([[0, 1], [0, -0.1]], [[0], [1]], dt=0.1, u_max=1)
+    interview = Interview(plant, bryson([1, 0.5], [1]), x0=[[1, 0], [0, 0.5], [0.7, 0.2]], key=1)
+    return interview, {"names": EVIL, "units": EVIL, "title": f"{EVIL[0]} </title> 😀"}
+
+
+@pytest.mark.parametrize("width", [390, 1280])
+@pytest.mark.parametrize("make", [of_the_pendulum, of_my_own])
+def test_a_file_of_its_own(tmp_path: Path, make: Any, width: int) -> None:
+    jax.config.update("jax_enable_x64", True)
+    interview, shown = make()
+    path = tmp_path / "ask.html"
+    interview.to_html(path, **shown)
+    with Browser(width, 900, prefers_color_scheme="dark") as page:
+        visited(page, page=path)
+        assert page("document.title") == shown["title"]
+        assert page("document.querySelector('h1').textContent") == shown["title"]
+        assert page("document.querySelectorAll('script').length") == 2
+        assert page("document.querySelectorAll('main > p b').length") == 1
+        assert page("document.documentElement.dataset.theme") == "dark"
+        assert page("document.documentElement.scrollWidth") <= width
+        assert shown["names"][1] in page("document.querySelector('.ask').textContent")
+        for number in range(6):
+            before = count(page)
+            page.press(("ArrowLeft", "ArrowRight", "ArrowDown")[number % 3])
+            page.until(lambda before=before: count(page) != before, "another question")
+        assert page("visit.shifts") < 0.02
+        page.open(path.as_uri())  # again: nothing is lost
+        page.wait("visit.questions.length > 0")
+        assert count(page) == "Question 7"
+        page("document.querySelectorAll('details').forEach((d) => { d.open = true; })")
+        code = page("document.querySelector('.ask-code').textContent")
+        page.click(".ask-save")
+        file = page.downloads / "answers.jsonl"
+        page.until(file.is_file, "the download")
+        resumed = Interview.load(file, append=False)
+        assert resumed.labels.tolist() == [1, 0, 0.5] * 2
+        assert len(Comparisons.load(file)) == 6
+        os.chdir(page.downloads)
+        exec(code, {})
+        page.click(".ask-stop")
+        page.until(lambda: over(page), "the end")
+        page.click(".ask-test")
+        page.until(lambda: count(page).startswith("Pair 1 "), "the blind test")
+        # Nothing but the file itself was read, and its policy let nothing else run.
+        assert {r for r in page.requests if not r.startswith("blob:")} == {path.as_uri()}
+        page("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=\"spoiled = 1\">')")
+        assert page("typeof spoiled") == "undefined"

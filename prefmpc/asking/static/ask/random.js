@@ -33,9 +33,13 @@
   const normals = (source, rows, columns) =>
     Array.from({ length: rows }, () => Array.from({ length: columns }, () => source.normal()));
 
-  // States, each entry uniform within its radius.
-  const states = (source, radius, count) =>
-    Array.from({ length: count }, () => radius.map((r) => (2 * source.uniform() - 1) * r));
+  // States: each entry uniform within its radius; or of a list, each at most once.
+  function states(source, x0, count) {
+    if (!Array.isArray(x0[0])) return Array.from({ length: count }, () => x0.map((r) => (2 * source.uniform() - 1) * r));
+    const left = x0.slice();
+    while (left.length > count) left.splice(whole(source, left.length), 1);
+    return left;
+  }
 
   // Where there is no better source of a seed than the clock, that one.
   function seed() {

@@ -7,7 +7,7 @@
   const hidden = (text) => element("span", { class: "ask-hidden" }, text);
   const key = (text) => element("kbd", { "aria-hidden": "true" }, text);
 
-  // actions: {answer(value), undo, toggle, again, stop, test, more, visit, forget, save, copy}.
+  // actions: {answer(value), undo, toggle, again, stop, test, more, visit, forget or null, save, copy}.
   function view(root, config, actions) {
     const id = root.id || "ask", on = (action) => () => actions[action]();
     const button = (action, label, ...more) =>
@@ -29,8 +29,10 @@
       forget: button("forget", "Forget everything"), save: button("save", "Download the answers"),
       copy: button("copy", "Copy"), banner: element("p", { class: "ask-banner", hidden: "" }),
     };
-    const legend = element("p", { class: "ask-legend", "aria-hidden": "true" }, ...config.outputs.names.map((name, i) =>
-      element("span", {}, element("i", { class: `ask-swatch ask-${config.outputs.colours[i]}` }), name)));
+    const named = config.plots.filter((plot) => plot.legend), many = named.length > 1;
+    const legend = element("p", { class: "ask-legend", "aria-hidden": "true" }, ...named.flatMap((plot) => [
+      ...(many ? [`${plot.label}:`] : []),
+      ...plot.names.map((name, i) => element("span", {}, element("i", { class: `ask-swatch ask-${plot.colours[i]}` }), name))]));
     const stage = element("div", { class: "ask-stage", role: "group", tabindex: "-1", "aria-labelledby": `${id}-title` },
       ...cards.map((card) => card.element), parts.over);
     root.replaceChildren(
@@ -43,7 +45,7 @@
         element("p", {}, "Each line of the file is one answer with its whole question. These lines of Python load it, fit the weights again and run the controller:"),
         element("pre", { class: "ask-code", tabindex: "0", "aria-label": "Python code" }, element("code", {}, config.code)),
         element("p", { class: "ask-row" }, parts.save, parts.copy)),
-      element("p", { class: "ask-row" }, parts.stop, parts.visit, parts.forget));
+      element("p", { class: "ask-row" }, parts.stop, ...(config.visitor ? [parts.visit] : []), ...(actions.forget ? [parts.forget] : [])));
     root.classList.add("ask-ready");
     return { ...parts, root, stage, cards, button };
   }
@@ -67,7 +69,7 @@
   }
 
   // A bar for each weight on a logarithmic axis from 1/100 to 100 times the default.
-  function weights(v, state) {
+  function weights(v, state, standard) {
     const place = (ratio) => 50 + 25 * Math.log10(Math.min(Math.max(ratio, 0.01), 100));
     const rows = state.weights.map(({ name, unit, weight, ratio, low, high }) => {
       const bar = element("div", { class: "ask-bar", "aria-hidden": "true" }, element("i"), element("b"));
@@ -82,7 +84,7 @@
     const scale = ["0.01", "0.1", "1", "10", "100"].map((text) => element("span", {}, text));
     const heads = ["weight of the squared", element("span", { class: "ask-scale" }, ...scale), "times default", "in σ"];
     v.weights.replaceChildren(
-      element("p", {}, "Each weight compared with Bryson’s rule (the middle), after division by what all have in common, on which no controller depends. The bar holds 90 % of what your answers leave possible."),
+      element("p", {}, `Each weight compared with ${standard} (the middle), after division by what all have in common, on which no controller depends. The bar holds 90 % of what your answers leave possible.`),
       element("table", {}, element("thead", {}, element("tr", {}, ...heads.map((text) => element("th", { scope: "col" }, text)))), element("tbody", {}, ...rows)));
   }
 

@@ -31,7 +31,8 @@
   // Purposes of random numbers.
   const SAMPLES = 0, QUESTION = 1, STATES = 2, TRIAL = 3;
 
-  // config: see masses.js; given: {seed, log, …}, log: the lines of an earlier session.
+  // config: see masses.js; given: {seed, log, …}, log: the lines of an earlier session, whose
+  // first line the new ones keep.
   function interviewer(config, given = {}) {
     const { lines, answers } = given.log ? parse(given.log) : { lines: [], answers: [] };
     const options = {
@@ -112,7 +113,7 @@
       },
       progress: async () => progress(),
       trial: async (count) => trial(count),
-      log: async () => written(config, options, key, answers),
+      log: async () => written(lines[0] || head(config, options, key), answers),
     };
   }
 
@@ -161,10 +162,10 @@
 
   // ---- the log ----
 
-  function written(config, options, key, answers) {
+  function head(config, options, key) {
     const { A, B, C, uMin, uMax, dt } = config;
     const { Q, R } = config.centre, diag = ask.linalg.diag;
-    const head = {
+    return {
       "prefmpc interview": FORMAT,
       system: { A, B, C, u_min: uMin, u_max: uMax, dt },
       prior: { Q: diag(Q), R: diag(R), strength: 1 },
@@ -173,9 +174,12 @@
       controller: "lqr", horizon: 10, constraints: null, pool: null, choose: "information",
       lapse: options.lapse, repeat_every: options.repeatEvery, samples: options.samples,
     };
+  }
+
+  function written(first, answers) {
     const lines = answers.map(({ label, question }, number) =>
       ({ answer: label, number, batch: [number, 1], question }));
-    return [head, ...lines].map((line) => JSON.stringify(line, finite) + "\n").join("");
+    return [first, ...lines].map((line) => JSON.stringify(line, finite) + "\n").join("");
   }
 
   // JSON has no infinite numbers: they are texts, as in the library's logs.
@@ -185,7 +189,12 @@
   function parse(text) {
     const lines = text.split("\n").filter(Boolean).map((line) => JSON.parse(line));
     if (lines[0]["prefmpc interview"] !== FORMAT) throw new Error("this is no log of an interview");
-    return { lines, answers: lines.slice(1).map(({ answer, question }) => ({ label: answer, question })) };
+    const answers = [];
+    for (const line of lines.slice(1)) {
+      if ("undo" in line) answers.pop();
+      else answers.push({ label: line.answer, question: line.question });
+    }
+    return { lines, answers };
   }
 
   // An interview goes on as it was begun.

@@ -51,10 +51,13 @@
       { name: "force on mass 1", unit: "1/N²" },
       { name: "force on mass 3", unit: "1/N²" },
     ],
-    // What is plotted; an output is at rest when it is near 0.
-    outputs: { label: "position in m", names: ["mass 1", "mass 2", "mass 3"], colours: [0, 1, 2], near: 0.05 },
-    forces: { label: "force in N", names: ["force on mass 1", "force on mass 3"], colours: [0, 2] },
-    draw: ask.draw && ask.draw.masses,
+    // What is plotted of x, u and y; a signal is at rest when it is near 0.
+    plots: [
+      { signal: "y", index: [0, 1, 2], label: "position in m", names: ["mass 1", "mass 2", "mass 3"], colours: [0, 1, 2], near: 0.05, legend: true },
+      { signal: "u", index: [0, 1], label: "force in N", names: ["force on mass 1", "force on mass 3"], colours: [0, 2] },
+    ],
+    draw: "masses", // one of ask.draw.scenes
+    standard: "Bryson’s rule", // what the centre is called
     // Somebody whose answers can be watched: the weights of the paper's first case study.
     visitor: [40, 40, 40, 5, 5, 5, 0.2, 0.2],
     code: `import jax

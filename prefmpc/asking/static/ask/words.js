@@ -32,18 +32,18 @@
     return sure + same;
   }
 
-  const TEST = "Now the blind test: ten pairs from new starts. One response is by the controller " +
-    "learned from you, the other by the usual default, Bryson’s rule. You are not told which.";
+  const test = (standard) => "Now the blind test: pairs from new starts. One response is by the controller " +
+    `learned from you, the other by the usual default, ${standard}. You are not told which.`;
 
   function verdict({ wins, count, ties, low, high }) {
     const undecided = ties ? ` (${ties} time${ties === 1 ? "" : "s"} you saw no difference)` : "";
     const range = `between ${percent(low)} and ${percent(high)} of all pairs`;
     const meaning = low > 0.5 ? "That is more than chance." : high < 0.5
       ? "That is bad news: the default suits you better. Either some answers were slips, or no sum of squares describes what you want."
-      : "Ten pairs cannot tell that from chance: the two may be about equally good for you.";
+      : "So few pairs cannot tell that from chance: the two may be about equally good for you.";
     if (!count) return "You saw no difference in any pair: the default is as good for you.";
     return `You chose the learned one ${wins} time${wins === 1 ? "" : "s"} out of ${count}${undecided}. With 95 % confidence you would choose it in ${range}. ${meaning}`;
   }
 
-  ask.words = { TEST, percent, progress, resting, sureness, verdict };
+  ask.words = { percent, progress, resting, sureness, test, verdict };
 })(globalThis.prefmpcAsk = globalThis.prefmpcAsk || {});

@@ -3,11 +3,13 @@
 // prefmpcAsk.mount(root, config, given) puts it into an element. given (all optional):
 //   interviewer(log)  makes one (see interview.js) that goes on from a log, or begins anew
 //   storage           a name under which the session is kept, null for none
-//   seed              of the session
+//   seed              of the session, unless config.log holds one that was begun
+//   anywhere          whether some keys count while the focus is nowhere (default: true)
+//   notice            to be read before the first answer
 (function (ask) {
   "use strict";
   const { cover, know, view, weights } = ask.view;
-  const { TEST, resting, verdict } = ask.words;
+  const { resting, test: announced, verdict } = ask.words;
   const { still } = ask.player;
 
   const PAIRS = 10;
@@ -15,18 +17,20 @@
 
   function mount(root, config, given = {}) {
     const begin = given.interviewer ||
-      ((log) => ask.interview.interviewer(config, log ? { log } : { seed: given.seed }));
+      ((log = config.log) => ask.interview.interviewer(config, log ? { log } : { seed: given.seed }));
     const place = given.storage === null ? ask.store.nowhere :
       ask.store.store(given.storage || `prefmpc: ${config.name}`);
+    const anywhere = given.anywhere !== false;
     const doing = (action) => () => act(action);
     const actions = {
       answer, again, save, copy, toggle: () => clock.toggle(), undo: doing(undo), stop: doing(stop),
-      test: doing(test), more: doing(more), visit: doing(visit), forget: doing(forget),
+      test: doing(test), more: doing(more), visit: doing(visit),
+      forget: given.storage === null ? null : doing(forget),
     };
     const v = view(root, config, actions);
     const duration = (config.method?.steps ?? ask.interview.DEFAULTS.steps) * config.dt;
     const clock = ask.player.player(duration, (share) => v.cards.forEach((card) => card.move(share)), playing);
-    let session, own = null, busy = true, timer = 0, shown = null;
+    let session, own = null, busy = true, timer = 0, shown = null, notice = given.notice || "";
 
     // A session: {interviewer, person (of a simulated visitor), phase, pairs, answers, more, state}.
     async function open(kept, person = null) {
@@ -48,9 +52,8 @@
     async function show() {
       const { phase, state, person } = session;
       know(v, state);
-      weights(v, state);
-      v.banner.hidden = !person;
-      v.banner.textContent = "A simulated visitor answers, with the weights of the paper’s first case study. Your own answers are put aside.";
+      weights(v, state, config.standard);
+      say(person ? "A simulated visitor answers, with the weights of the paper’s first case study. Your own answers are put aside." : notice);
       v.visit.lastChild.textContent = person ? "Stop watching" : "Watch a simulated visitor";
       v.stop.disabled = phase !== "asking" || !state.count || Boolean(person);
       v.forget.disabled = Boolean(person);
@@ -62,6 +65,19 @@
       else if (phase === "rest") rest();
       else done();
       visitorsTurn();
+    }
+
+    function say(text) {
+      v.banner.hidden = !text;
+      v.banner.textContent = text;
+    }
+
+    // What went wrong is said, and nothing else changes.
+    function complain(error) {
+      console.error(error);
+      notice = `That did not work: ${error.message}`;
+      say(notice);
+      v.say.textContent = notice;
     }
 
     const asking = () => session.phase === "asking" || session.phase === "trial";
@@ -76,14 +92,14 @@
     function trial() {
       cover(v, null);
       v.title.textContent = "Blind test: which one do you prefer?";
-      v.count.textContent = `Pair ${session.answers.length + 1} of ${PAIRS}`;
+      v.count.textContent = `Pair ${session.answers.length + 1} of ${session.pairs.length}`;
       present(session.pairs[session.answers.length]);
     }
 
     async function rest() {
       v.title.textContent = session.state.enough ? "I know enough" : "That is enough";
       v.count.textContent = "";
-      const texts = [resting(session.state), TEST];
+      const texts = [resting(session.state), announced(config.standard)];
       if (!shown) present(await session.interviewer.next());
       finish(texts, [v.button("test", "Start the blind test"), v.button("more", "Ask me more")]);
     }
@@ -91,7 +107,7 @@
     function done() {
       v.title.textContent = "The blind test is over";
       v.count.textContent = "";
-      if (!shown) present(session.pairs[PAIRS - 1]);
+      if (!shown) present(session.pairs.at(-1));
       finish([verdict(ask.blind.verdict(session.pairs, session.answers))],
         [v.button("save", "Download the answers"), v.button("test", "Test again"), v.button("more", "Ask me more")]);
     }
@@ -134,10 +150,13 @@
     async function act(action) {
       if (busy) return;
       busy = true;
+      notice = "";
       try {
         await action();
         await show();
         await keep();
+      } catch (error) {
+        complain(error);
       } finally {
         busy = false;
       }
@@ -149,7 +168,7 @@
       act(async () => {
         if (session.phase === "trial") {
           session.answers.push(value);
-          if (session.answers.length === PAIRS) session.phase = "done";
+          if (session.answers.length === session.pairs.length) session.phase = "done";
           return;
         }
         session.state = await session.interviewer.answer(value);
@@ -237,7 +256,7 @@
         ArrowDown: inside && (() => answer(0.5)),
         " ": inside && !at.closest("button, summary, a") && (() => clock.toggle()),
       };
-      if (!keys[event.key] || !(inside || at === document.body)) return;
+      if (!keys[event.key] || !(inside || (anywhere && at === document.body))) return;
       event.preventDefault();
       if (!event.repeat) keys[event.key]();
       if (!inside) focus();
@@ -249,9 +268,9 @@
       await open(kept).catch(() => open(null)); // what was kept may be of another version
       await show();
       busy = false;
-      if (document.activeElement === document.body && !location.hash) focus();
-    })();
-    return { question: () => shown, state: () => session.state, unmount: () => document.removeEventListener("keydown", pressed) };
+      if (anywhere && document.activeElement === document.body && !location.hash) focus();
+    })().catch(complain);
+    return { say, question: () => shown, state: () => session.state, unmount: () => document.removeEventListener("keydown", pressed) };
   }
 
   ask.mount = mount;

@@ -84,5 +84,11 @@
     });
   }
 
-  ask.plant = { gain, gainOf, loop, loopFeatures, features };
+  // A configuration as JSON has it: open limits are null.
+  function limited(config) {
+    const bounds = (values, open) => values.map((value) => value ?? open);
+    return { ...config, uMin: bounds(config.uMin, -Infinity), uMax: bounds(config.uMax, Infinity) };
+  }
+
+  ask.plant = { limited, gain, gainOf, loop, loopFeatures, features };
 })(globalThis.prefmpcAsk = globalThis.prefmpcAsk || {});

@@ -22,28 +22,35 @@
     return [1, 1.5, 2, 3, 4, 5, 6, 8, 10].find((m) => m * unit >= value) * unit;
   }
 
-  // Words for those who do not see the curves.
-  function description(trajectory, config) {
-    const { y, u } = trajectory, steps = u.length;
-    const outputs = config.outputs.names.map((name, i) => {
-      const values = y.map((row) => row[i]), near = config.outputs.near;
+  // The signals of a plot over time: states and outputs at N + 1 times, inputs held in N steps.
+  function rows(plot, { x, u, y }, config) {
+    const all = { x, u, y: config.C ? x.map((state) => ask.linalg.times(config.C, state)) : y };
+    return all[plot.signal].map((row) => plot.index.map((i) => row[i]));
+  }
+
+  const short = (value) => String(Number(value.toPrecision(2)));
+
+  // Words for those who do not see the curves; reach: the limits of the axes.
+  function description(trajectory, config, reach) {
+    const steps = trajectory.u.length;
+    const words = config.plots.flatMap((plot, p) => plot.names.map((name, i) => {
+      const values = rows(plot, trajectory, config).slice(0, steps).map((row) => row[i]);
+      if (plot.signal === "u") return `largest ${name} ${short(largest([values]))}`;
+      const near = plot.near ?? 0.05 * reach[p];
       const last = values.findLastIndex((value) => Math.abs(value) > near) + 1;
-      const when = last < steps ? `after ${(last * config.dt).toFixed(1)} s` : "not to the end";
-      return `${name} starts at ${values[0].toFixed(2)} and stays within ${near}: ${when}`;
-    });
-    const inputs = config.forces.names.map((name, i) =>
-      `largest ${name} ${largest(u.map((row) => [row[i]])).toFixed(2)}`);
-    return `${[...outputs, ...inputs].join("; ")}.`;
+      const when = last < steps ? `after ${short(last * config.dt)} s` : "not to the end";
+      return `${name} starts at ${short(values[0])} and stays within ${short(near)}: ${when}`;
+    }));
+    return `${words.join("; ")}.`;
   }
 
   // side: "first" or "second". Returns {element, button, show(trajectory, reach), move(share), flash()}.
   function card(side, config, id, choose) {
     const name = side === "first" ? "Left" : "Right", arrow = side === "first" ? "←" : "→";
-    const scene = config.draw ? config.draw() : null;
-    const charts = [
-      chart(config.outputs, `${id}-${side}-y`, 158, false),
-      chart({ ...config.forces, step: true }, `${id}-${side}-u`, 152, true),
-    ];
+    const scene = config.draw ? ask.draw.scenes[config.draw]() : null;
+    const end = config.plots.length - 1; // under the last one stands the time
+    const charts = config.plots.map((plot, i) => chart(
+      { ...plot, step: plot.signal === "u" }, `${id}-${side}-${i}`, i === end ? 152 : 158, i === end));
     const words = element("p", { class: "ask-hidden", id: `${id}-${side}-words` });
     const button = element("button", {
       type: "button", class: "ask-choose", "data-answer": side, "aria-describedby": words.id, onclick: choose,
@@ -56,11 +63,9 @@
 
     function show(trajectory, reach) {
       shown = trajectory;
-      const { x, u } = trajectory;
-      const y = x.map((state) => ask.linalg.times(config.C, state));
-      charts[0].show(y, reach[0], u.length, config.dt);
-      charts[1].show(u, reach[1], u.length, config.dt);
-      words.textContent = description(trajectory, config);
+      charts.forEach((c, i) =>
+        c.show(rows(config.plots[i], trajectory, config), reach[i], trajectory.u.length, config.dt));
+      words.textContent = description(trajectory, config, reach);
     }
 
     // share: of the whole time, from 0 to 1.
@@ -79,13 +84,14 @@
     return { element: made, button, show, move, flash };
   }
 
-  // Common limits of the axes of both sides.
+  // Common limits of the axes of both sides, one for each plot: of inputs those that the plant has.
   function reach(question, config) {
     const sides = [question.first, question.second];
-    const y = Math.max(...sides.map(({ x }) => largest(x.map((s) => ask.linalg.times(config.C, s)))));
-    const u = Math.max(...sides.map((side) => largest(side.u)));
-    const limit = Math.max(...config.uMax.concat(config.uMin.map((v) => -v)).filter(Number.isFinite), 0);
-    return [above(y), limit || above(u)];
+    return config.plots.map((plot) => {
+      const limits = plot.index.flatMap((i) => [config.uMax[i], -config.uMin[i]]).filter(Number.isFinite);
+      const limit = plot.signal === "u" ? Math.max(...limits, 0) : 0;
+      return limit || above(Math.max(...sides.map((side) => largest(rows(plot, side, config)))));
+    });
   }
 
   ask.card = { card, description, element, reach };

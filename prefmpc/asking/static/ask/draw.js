@@ -17,7 +17,17 @@
       + 4 * c[i] - d[i] + t * (3 * (value - c[i]) + d[i] - a[i]))));
   }
 
+  // Between ticks: 1, 2, 5, 10, … so that there are at most six.
+  function spacing(length) {
+    const unit = 10 ** Math.floor(Math.log10(length / 5));
+    return [1, 2, 5, 10].find((m) => m * unit * 5.000001 >= length) * unit;
+  }
+
   const LEFT = 62, RIGHT = 474, WIDTH = 480, FINE = 5;
+
+  // A long text is written in so much room.
+  const squeezed = (text, room) =>
+    (text.length * 8 > room ? { textLength: room, lengthAdjust: "spacingAndGlyphs" } : {});
 
   // One set of axes. kind: {label, names, step: held between the samples}. Returns
   // {element, show(rows, reach, steps, dt), move(share)}.
@@ -37,7 +47,7 @@
       svg("rect", { ...box, class: "ask-box" }),
       svg("line", { class: "ask-zero", x1: LEFT, x2: RIGHT, y1: middle, y2: middle }),
       upper, svg("text", { class: "ask-tick", x: LEFT - 6, y: middle + 5 }, "0"), lower, times,
-      svg("text", { class: "ask-axis", transform: `translate(15 ${middle}) rotate(-90)` }, kind.label),
+      svg("text", { class: "ask-axis", transform: `translate(15 ${middle}) rotate(-90)`, ...squeezed(kind.label, bottom - top) }, kind.label),
       ...faint, svg("g", { "clip-path": `url(#${id})` }, ...bright), cursor);
 
     function show(rows, reach, steps, dt) {
@@ -59,10 +69,11 @@
         bright[i].setAttribute("points", text);
       });
       if (!last) return;
-      const seconds = Math.floor(steps * dt), every = Math.max(1, Math.ceil(seconds / 5));
+      const every = spacing(steps * dt);
       const ticks = [];
-      for (let s = 0; s <= seconds; s += every) {
-        ticks.push(svg("text", { class: "ask-tick ask-time", x: at(s / dt), y: bottom + 18 }, `${s}`));
+      for (let i = 0; i * every <= steps * dt * (1 + 1e-9); i++) {
+        const text = String(Number((i * every).toPrecision(6)));
+        ticks.push(svg("text", { class: "ask-tick ask-time", x: at((i * every) / dt), y: bottom + 18 }, text));
       }
       const name = { class: "ask-tick ask-time", x: (LEFT + RIGHT) / 2, y: height - 2 };
       times.replaceChildren(...ticks, svg("text", name, "time in s"));
@@ -119,5 +130,5 @@
     return `M${from.toFixed(1)} ${y}H${to.toFixed(1)}m${-sign * head} -5l${sign * head} 5l${-sign * head} 5`;
   }
 
-  ask.draw = { between, chart, masses, svg };
+  ask.draw = { between, chart, scenes: { masses }, svg };
 })(globalThis.prefmpcAsk = globalThis.prefmpcAsk || {});
