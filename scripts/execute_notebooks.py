@@ -82,6 +82,8 @@ def clean(notebook: NotebookNode) -> NotebookNode:
             data = output.get("data", {})
             if "image/png" in data:
                 data["image/png"] = plain_png(data["image/png"])
+            # A widget lives in its kernel: its picture stays, and no page waits for the network.
+            data.pop("application/vnd.jupyter.widget-view+json", None)
     return notebook
 
 

@@ -197,7 +197,11 @@ None, prior | Interview: prior
 0, None | Interview.answer: value
 0, 1.5, 10^30, inf | least_gain
 0 | lapse, repeat_every
-0, 1.5, 10^30 | Interview.finished: level
+0, 1.5, 10^30 | Interview.finished: level, ask: level
+digits, text | title
+None, digits, text | draw
+None | Interview.to_html: names, Interview.to_html: units, ask: names, ask: units
+True | Interview.to_html: overwrite
 """
 """What is right after all | for which argument of all calls, or of one call, which goes before."""
 

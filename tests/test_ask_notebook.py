@@ -297,23 +297,23 @@ def test_every_answer_is_there_once_and_in_order_after_50_kills(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("given", "words"),
+    ("function", "given", "words"),
     [
-        ({"interview": CART}, "interview must be a Interview"),
-        ({"log": 3}, "log must be a path"),
-        ({"names": ["a"]}, "names must hold a text for each of 2 states and 1 inputs"),
-        ({"units": [0, 1, 2]}, "units must hold a text"),
-        ({"draw": 3}, "draw must be a text"),
-        ({"who": ""}, "who must be a text"),
-        ({"who": "Anna"}, "log must be given"),
-        ({"level": -1}, "level must be"),
-        ({"certain": 1}, "certain must lie in"),
-        ({"most": 0}, "most must be a whole number"),
+        (ask, {"interview": CART}, "interview must be a Interview"),
+        (ask, {"log": 3}, "log must be a path"),
+        (ask, {"names": ["a"]}, "names must hold a text for each of 2 states and 1 inputs"),
+        (ask, {"units": [0, 1, 2]}, "units must hold a text"),
+        (ask, {"draw": 3}, "draw must be a text"),
+        (ask, {"who": ""}, "who must be a text"),
+        (ask, {"who": "Anna"}, "log must be given"),
+        (ask, {"level": -1}, "level must be"),
+        (ask, {"certain": 1}, "certain must lie in"),
+        (ask, {"most": 0}, "most must be a whole number"),
     ],
 )
-def test_bad_input_to_ask_is_named(given: dict[str, Any], words: str) -> None:
+def test_bad_input_to_ask_is_named(function: Any, given: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        ask(**{"interview": cart(), **given})
+        function(**{"interview": cart(), **given})
 
 
 def test_without_anywidget_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

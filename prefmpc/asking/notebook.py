@@ -17,6 +17,7 @@ from prefmpc._checks import instance, nonnegative, positive_int, share
 from prefmpc.asking.desk import Desk
 from prefmpc.asking.files import resume
 from prefmpc.asking.interview import Interview
+from prefmpc.asking.options import FUNCTIONS
 from prefmpc.asking.page import appearance, scripts, source
 from prefmpc.systems.linear import LinearSystem
 
@@ -24,7 +25,7 @@ CODE = """import jax
 from prefmpc import Interview
 
 jax.config.update("jax_enable_x64", True)
-interview = Interview.load({log!r}, append=False)  # {functions}
+interview = Interview.load({log!r}, append=False{functions})
 print(interview.model, interview.regret)
 """
 
@@ -116,7 +117,9 @@ def _notes(who: str | None) -> dict[str, Any]:
 def _config(interview: Interview, shown: dict[str, Any], most: int) -> dict[str, Any]:
     system, log = interview.system, interview._log
     kept = "answers.jsonl" if log is None else str(log.path)
-    functions = "all functions of the interview as well, if it has any"
+    linear = isinstance(system, LinearSystem)
+    needed = [name for name in FUNCTIONS if callable(getattr(interview._options, name))]
+    functions = "".join(f", {name}={name}" for name in needed + ["system"] * (not linear))
     out = {
         "name": "",
         **shown,

@@ -106,6 +106,9 @@ def appearance(options: Options, names: Any, units: Any, draw: str | None = None
         raise ValueError(f"units must be one for each of {len(names)} names, got {len(units)}")
     shown, kind = _shown(system, len(names))
     signals = list(zip(names, units, strict=True))
+    plots = _plots(kind, [signals[i] for i in shown]) + _plots("u", signals[nx : nx + nu])
+    if masses:
+        plots[-1]["colours"] = [0, 2]  # those of the masses on which they act
     weighed = [{"name": name, "unit": _inverse_square(unit)} for name, unit in signals]
     bounds = {"uMin": system.u_min, "uMax": system.u_max}
     limits = {k: [float(b) if np.isfinite(b) else None for b in v] for k, v in bounds.items()}
@@ -114,9 +117,9 @@ def appearance(options: Options, names: Any, units: Any, draw: str | None = None
         "dt": float(system.dt),
         "states": weighed[:nx],
         "inputs": weighed[nx : nx + nu],
-        "plots": _plots(kind, [signals[i] for i in shown]) + _plots("u", signals[nx : nx + nu]),
+        "plots": plots,
         "draw": draw or ("masses" if masses else None),
-        "standard": "the default that stood at the beginning",
+        "standard": "the weights from before the first answer",
     }
 
 
@@ -132,6 +135,7 @@ def _texts(name: str, value: Any, system: Any) -> list[str]:
 
 
 def _are_the_masses(system: Any) -> bool:
+    """Whether a plant is the book's, which has a drawing."""
     masses = oscillating_masses()
     return isinstance(system, LinearSystem) and all(
         np.array_equal(getattr(system, name), getattr(masses, name)) for name in ("A", "B", "dt")

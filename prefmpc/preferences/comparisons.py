@@ -218,6 +218,8 @@ class Comparisons:
 
         A ValueError says what is wrong with any other file, of a log with line and field.
         """
+        if not isinstance(path, str | os.PathLike):
+            raise ValueError(f"path must be a path, got {type(path).__name__}")
         if Path(path).suffix == ".jsonl":
             answers, _ = answers_of(read(path)[0], path)
             first, second = ([a.question[side] for a in answers] for side in ("first", "second"))

@@ -42,7 +42,7 @@
     }
 
     async function keep() {
-      if (session.person) return;
+      if (session.person || given.storage === null) return;
       const { phase, pairs, answers, more } = session;
       place.write({ log: await session.interviewer.log(), phase, pairs, answers, more });
     }
@@ -83,10 +83,11 @@
     const asking = () => session.phase === "asking" || session.phase === "trial";
 
     async function question() {
+      const next = await session.interviewer.next();
       cover(v, null);
       v.title.textContent = "Which one do you prefer?";
       v.count.textContent = `Question ${session.state.count + 1}`;
-      present(await session.interviewer.next());
+      present(next);
     }
 
     function trial() {
