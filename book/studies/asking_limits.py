@@ -19,7 +19,16 @@ from prefmpc.preferences.people import Preference, logistic
 from prefmpc.preferences.pools import random_states
 from prefmpc.preferences.trajectories import max_input, phi, settling_time
 from prefmpc.systems.linear import oscillating_masses
-from studies.asking import FORCE_MAX, STEPS, Person, answer_until, draw_person, paper_pool, rule
+from studies.asking import (
+    FORCE_MAX,
+    REACH,
+    STEPS,
+    Person,
+    answer_until,
+    draw_person,
+    paper_pool,
+    rule,
+)
 from studies.onesided import ONE_SIDED, one_sided, option_pairs, person_loops
 from studies.quadratic import (
     QUADRATIC_HORIZON,
@@ -92,9 +101,7 @@ def stopping_case(
         rng = np.random.default_rng([seed, 1, number])
         who = STOPPING_PEOPLE[number]
         person = draw_person(who, rng) if ", " in who else prior_person(rng)
-        interview = Interview(
-            oscillating_masses(), rule(), x0=RADIUS, key=int(rng.integers(2**63))
-        )
+        interview = Interview(oscillating_masses(), rule(), x0=RADIUS, key=int(rng.integers(2**63)))
         models: list[Any] = [None] * size
         for n in range(1, cap + 1):
             answer_until(interview, person.answers, n, rng)
@@ -145,12 +152,13 @@ LIMIT_COUNTS = (5, 10, 20, 40)
 WAYS = ("information", "random")
 """How pairs of closed loops from one x(0) are chosen."""
 
-PRIORS: dict[str, tuple[WishartPrior, float]] = {
-    "Bryson's rule": (rule(), 2.0),
-    "speeds too dear": (bryson(RADIUS, FORCE_MAX), 2.0),
-    "speeds too dear, and sure of it": (bryson(RADIUS, FORCE_MAX), 0.5),
+PRIORS = {
+    "Bryson's rule": (REACH, 2.0),
+    "speeds too dear": (RADIUS, 2.0),
+    "speeds too dear, and sure of it": (RADIUS, 0.5),
 }
-"""The centre and the spread of what is believed at first; the person is the paper's.
+"""The largest deviations for Bryson's rule, and the spread of what is believed at first about it;
+the person is the paper's.
 
 The second takes the speeds at the start for the largest ones: it weighs speeds 100 times as much
 as the first.
@@ -197,9 +205,9 @@ def limits_case(
 
     person, careless = the_person(), lapsing(the_person())
     models: list[Any] = [QuadraticCost(QUADRATIC_Q, QUADRATIC_R)]
-    for prior, spread in PRIORS.values():
+    for reach, spread in PRIORS.values():
         for way in WAYS:
-            models += learn(person, prior, way, spread=spread)
+            models += learn(person, bryson(reach, FORCE_MAX), way, spread=spread)
     for lapse in ASSUMED.values():
         for way in WAYS:
             models += learn(careless, rule(), way, lapse=lapse)
