@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from studies import (
     asking,
+    asking_limits,
     lane,
     measures,
     onesided,
@@ -95,6 +97,40 @@ STUDIES: dict[str, Study] = {
         {
             **{"people": asking.PEOPLE, "strategies": tuple(asking.STRATEGIES)},
             "counts": asking.COUNTS,
+        },
+    ),
+    "fewer": (
+        partial(
+            asking.asking_case,
+            people=("paper, sure",),
+            strategies=("made on purpose",),
+            counts=asking.FEWER,
+        ),
+        "extensions/fewer_spread.json",
+        {"counts": asking.FEWER},
+    ),
+    "stopping": (
+        asking_limits.stopping_case,
+        "extensions/stopping_spread.json",
+        {
+            **{"people": asking_limits.STOPPING_PEOPLE, "counts": asking_limits.STOPPING_COUNTS},
+            **{"measures": asking_limits.MEASURES, "tests": asking_limits.TESTS},
+        },
+    ),
+    "limits": (
+        asking_limits.limits_case,
+        "extensions/limits_spread.json",
+        {
+            **{"priors": tuple(asking_limits.PRIORS), "assumed": tuple(asking_limits.ASSUMED)},
+            **{"ways": asking_limits.WAYS, "counts": asking_limits.LIMIT_COUNTS},
+        },
+    ),
+    "settled": (
+        asking_limits.settled_case,
+        "extensions/settled_spread.json",
+        {
+            **{"variants": settling.SETTLING_VARIANTS, "ways": asking_limits.WAYS},
+            **{"counts": asking_limits.SETTLED_COUNTS, "columns": asking_limits.SETTLED_COLUMNS},
         },
     ),
     "references": (

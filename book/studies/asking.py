@@ -33,6 +33,7 @@ from studies.quadratic import (
 )
 
 COUNTS = (5, 10, 20, 40)
+FEWER = (10, 15, 20, 25)
 STEPS = 30
 REACH = np.repeat([0.3, 0.5], 3)
 """Metres and metres per second that the responses reach, by and large."""
@@ -120,12 +121,19 @@ def interviewed(
     )
     models: list[Any] = []
     for count in counts:
-        while len(interview) < count:
-            question = interview.next()
-            pair = stacked([question.first]), stacked([question.second])
-            interview.answer(float(rng.uniform() < person.answers(*pair)[0]))
+        answer_until(interview, person.answers, count, rng)
         models.append(interview.model)
     return models
+
+
+def answer_until(
+    interview: Interview, answers: Preference, count: int, rng: np.random.Generator
+) -> None:
+    """Let a person answer, by chance where they are not sure, until there are so many answers."""
+    while len(interview) < count:
+        question = interview.next()
+        pair = stacked([question.first]), stacked([question.second])
+        interview.answer(float(rng.uniform() < answers(*pair)[0]))
 
 
 STRATEGIES: dict[str, Strategy] = {
