@@ -392,7 +392,7 @@ def test_any_plant_can_be_shown() -> None:
     widget, sent = widget_of(interview, draw="() => null")
     assert [plot["signal"] for plot in widget.config["plots"]] == ["x", "u"]
     assert widget.config["draw"] == "own"
-    assert "scenes.own = () => (() => null)();" in widget._esm
+    assert "scenes.own = () => (\n() => null\n)();" in widget._esm
     widget._handle_custom_msg({"id": "a", "call": "progress"}, [])
     widget._handle_custom_msg({"id": "b", "call": "trial", "count": 2}, [])
     assert sent[0]["result"]["weights"] == []

@@ -137,7 +137,7 @@ def _widget(desk: Desk, config: dict[str, Any], notice: str, draw: str | None) -
         raise ImportError(
             "ask needs the package anywidget: pip install anywidget (or prefmpc[notebook])"
         ) from error
-    own = "" if draw is None else f"globalThis.prefmpcAsk.draw.scenes.own = () => ({draw})();\n"
+    own = "" if draw is None else f"prefmpcAsk.draw.scenes.own = () => (\n{draw}\n)();\n"
 
     class Ask(anywidget.AnyWidget):
         """The front end of a desk."""

@@ -93,6 +93,11 @@ def answer(browser: Browser, by_key: bool) -> None:
     browser.until(lambda: count(browser) != before, "another question")
 
 
+def written(file: Path) -> bool:
+    """Whether a download is there: its name is taken before it is."""
+    return file.is_file() and file.stat().st_size > 0
+
+
 def over(browser: Browser) -> bool:
     return bool(browser("!document.querySelector('.ask-over').hidden"))
 
@@ -139,7 +144,7 @@ def a_session(seed: int) -> tuple[float, int, dict[str, Any]]:
         wins = int(text.split("chose the learned one ")[1].split(" ")[0])
         browser.click(".ask-save")
         file = browser.downloads / "answers.jsonl"
-        browser.until(file.is_file, "the download")
+        browser.until(lambda: written(file), "the download")
         assert told(browser) == []
         assert [r for r in browser.requests if not r.startswith(("file:", "data:", "blob:"))] == []
         assert browser("visit.shifts") < 0.02
@@ -297,7 +302,7 @@ def test_a_file_of_its_own(tmp_path: Path, make: Any, width: int) -> None:
         code = page("document.querySelector('.ask-code').textContent")
         page.click(".ask-save")
         file = page.downloads / "answers.jsonl"
-        page.until(file.is_file, "the download")
+        page.until(lambda: written(file), "the download")
         resumed = Interview.load(file, append=False)
         assert resumed.labels.tolist() == [1, 0, 0.5] * 2
         assert len(Comparisons.load(file)) == 6
