@@ -54,7 +54,7 @@ def test_the_stored_files_are_about_what_the_code_says(name):
 
 
 def test_a_part_of_the_race_is_what_the_code_gives():
-    people, strategies = ("random, sure",), ("made on purpose", "random pairs of a pool")
+    people, strategies = ("random, sure",), ("made on purpose", "made on purpose, regret")
     fresh = asking.asking_case(
         key=jax.random.key(0), people=people, strategies=strategies, counts=(5, 10)
     )["regret"]

@@ -255,7 +255,8 @@ def settled_case(
     seed = int(generator(key).integers(2**63))
     system = oscillating_masses(u_max=np.inf)
     x0 = random_states(RADIUS, key=np.random.default_rng([seed, 0]), shape=(loops,))
-    models, skipped = [], []
+    models: list[Any] = []
+    skipped: list[int] = []
     for variant in SETTLING_VARIANTS:
         for way in ways:
             interview = Interview(
