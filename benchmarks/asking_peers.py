@@ -43,7 +43,7 @@ from prefmpc.preferences.trajectories import Trajectory
 from prefmpc.systems.linear import oscillating_masses
 from studies import asking
 from studies.quadratic import RADIUS
-from studies.spread import quantiles, write_spread
+from studies.spread import quantiles, read_spread, write_spread
 
 OUT = Path(__file__).resolve().parents[1] / "book" / "extensions" / "asking_peers.json"
 jax.config.update("jax_enable_x64", True)
@@ -56,7 +56,7 @@ FREE = np.delete(np.arange(len(CENTRE)), 6)
 LOOP_STEPS = 20
 HALF_WIDTH = 4.0
 SPREAD = 2.0
-REFITS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 30, 35, 40)
+REFITS = (1, 2, 3, 4, 5, 7, 10, 15, 20, 30, 40)
 """After these numbers of answers BoTorch fits its length scales anew."""
 
 Space = Callable[[np.ndarray], np.ndarray]
@@ -173,7 +173,7 @@ def botorch(
     bounds = torch.stack([torch.zeros(len(FREE)), torch.ones(len(FREE))]).double()
 
     def largest(value: Any, q: int) -> np.ndarray:
-        settings = {"num_restarts": 3, "raw_samples": 128, "options": {"maxiter": 40}}
+        settings = {"num_restarts": 2, "raw_samples": 128, "options": {"maxiter": 25}}
         return optimize_acqf(value, bounds=bounds, q=q, **settings)[0].numpy()
 
     for count in range(1, max(counts) + 1):
@@ -226,18 +226,19 @@ def aprel(
     rng: np.random.Generator,
     *,
     ours: bool = False,
+    rationality: float = 1.0,
 ) -> list[QuadraticCost]:
     """Ask the most informative pair of a pool, under a belief sampled by Metropolis-Hastings.
 
     As APReL does it: 100 samples, one in 20 after 200, and the mean is learned. Its weights have
-    norm 1 and multiply standardised features, its people choose with a rationality of 1; with
+    norm 1 and multiply standardised features, times the ``rationality`` of the person; with
     ``ours`` log weights are sampled from the posterior of an interview.
     """
     pool = asking.paper_pool(rng)
     size = len(CENTRE)
     features = squares(pool)
     scale = np.exp(-CENTRE) if ours else features.std(0)
-    features = features / scale
+    features = rationality * features / scale
     step, log_prior = (log_step, log_normal) if ours else (sphere_step, on_sphere)
     weights: Callable[[np.ndarray], np.ndarray] = np.exp if ours else np.asarray
     i, j = np.triu_indices(len(pool), 1)
@@ -290,6 +291,7 @@ PEERS: dict[str, asking.Strategy] = {
     "BoTorch EUBO, box, one x(0)": botorch,
     "BoTorch EUBO, our prior, new x(0)": partial(botorch, space=prior, x0="new"),
     "APReL, its belief": aprel,
+    "APReL, its belief, rationality 10": partial(aprel, rationality=10.0),
     "APReL, our prior": partial(aprel, ours=True),
 }
 
@@ -330,10 +332,13 @@ def main() -> None:
     parser.add_argument("--people", type=int, default=24, help="seeds 0 … PEOPLE − 1")
     parser.add_argument("--jobs", type=int, default=2, help="processes")
     parser.add_argument("--out", type=Path, default=OUT)
+    parser.add_argument("--resume", action="store_true", help="keep the draws that OUT holds")
     options = parser.parse_args()
     draws = []
+    if options.resume and options.out.exists():
+        draws = [{"regret": regret} for regret in read_spread(options.out)["regret"]]
     with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
-        for found in pool.imap(draw, range(options.people)):
+        for found in pool.imap(draw, range(len(draws), options.people)):
             draws.append(found)
             write(options.out, draws)
             print(f"{len(draws)} of {options.people}", flush=True)
