@@ -2,8 +2,8 @@
 
 Not a part of ``make bench``: the competitors need an environment of their own, which
 ``asking_peers.txt`` describes. There ``python benchmarks/asking_peers.py --people 24`` writes
-``book/extensions/asking_peers.json``. People, plant and measure are those of `studies.asking`, and
-person k here is person k there.
+``book/extensions/asking_peers.json`` and prints its table; ``--people 0 --resume`` only prints.
+People, plant and measure are those of `studies.asking`, and person k here is person k there.
 
 GLISp and BoTorch tune the weights of a controller. Seven log weights, relative to Bryson's rule,
 are searched; that of the first force stays, since a common factor changes no controller. The
@@ -43,19 +43,15 @@ from prefmpc.preferences.trajectories import Trajectory
 from prefmpc.systems.linear import oscillating_masses
 from studies import asking
 from studies.quadratic import RADIUS
-from studies.spread import quantiles, read_spread, write_spread
+from studies.spread import read_spread, write_spread
 
 OUT = Path(__file__).resolve().parents[1] / "book" / "extensions" / "asking_peers.json"
 jax.config.update("jax_enable_x64", True)
 
 PEOPLE = ("paper, sure", "paper, unsure", "random, sure", "random, unsure")
 CENTRE = np.log(np.concatenate([np.diag(M) for M in (asking.rule().Q, asking.rule().R)]))
-FREE = np.delete(np.arange(len(CENTRE)), 6)
-"""All weights but that of the first force."""
-
-LOOP_STEPS = 20
-HALF_WIDTH = 4.0
-SPREAD = 2.0
+FREE = np.delete(np.arange(len(CENTRE)), 6)  # all but that of the first force
+LOOP_STEPS, HALF_WIDTH, SPREAD = 20, 4.0, 2.0
 REFITS = (1, 2, 3, 4, 5, 7, 10, 15, 20, 30, 40)
 """After these numbers of answers BoTorch fits its length scales anew."""
 
@@ -129,9 +125,9 @@ def glisp(
     solvers.lhs = sampler
     np.random.seed(rng.integers(2**32))  # noqa: NPY002, the swarm's
     tuning = Tuning(person, space, x0, rng)
-    zero, one = np.zeros(len(FREE)), np.ones(len(FREE))
+    bounds = np.zeros(len(FREE)), np.ones(len(FREE))
     solver = solvers.GLISp(
-        bounds=(zero, one), n_initial_random=10, expected_max_evals=max(counts) + 1, display=0
+        bounds, n_initial_random=10, expected_max_evals=max(counts) + 1, display=0
     )
     best, proposed = solver.initialize()
     found = []
@@ -224,7 +220,6 @@ def aprel(
     person: asking.Person,
     counts: tuple[int, ...],
     rng: np.random.Generator,
-    *,
     ours: bool = False,
     rationality: float = 1.0,
 ) -> list[QuadraticCost]:
@@ -235,8 +230,7 @@ def aprel(
     ``ours`` log weights are sampled from the posterior of an interview.
     """
     pool = asking.paper_pool(rng)
-    size = len(CENTRE)
-    features = squares(pool)
+    size, features = len(CENTRE), squares(pool)
     scale = np.exp(-CENTRE) if ours else features.std(0)
     features = rationality * features / scale
     step, log_prior = (log_step, log_normal) if ours else (sphere_step, on_sphere)
@@ -304,26 +298,30 @@ def draw(seed: int, peers: tuple[str, ...] = tuple(PEERS)) -> dict[str, np.ndarr
 
 
 def table(regret: np.ndarray) -> list[dict[str, Any]]:
-    """Return a row for each competitor, kind of person and count, of regrets (draws, …)."""
+    """Return a row for each kind of person, competitor and count, of regrets (draws, …)."""
     rng = np.random.default_rng(0)
     resampled = regret[rng.integers(0, len(regret), (2000, len(regret)))]
-    medians = quantiles(np.moveaxis(resampled, 1, 0), 0.5)
-    low, high = np.quantile(medians, [0.025, 0.975], axis=0)
+    low, high = np.quantile(np.median(resampled, axis=1), [0.025, 0.975], axis=0)
     middle, most = np.quantile(regret, [0.5, 0.9], axis=0)
+    numbers = {"median": middle, "quantile 90 %": most, "median from": low, "median to": high}
     rows = []
-    for at in np.ndindex(regret.shape[1:]):
-        who, name, count = PEOPLE[at[0]], tuple(PEERS)[at[1]], asking.COUNTS[at[2]]
-        row = {"competitor": name, "people": who, "answers": count, "draws": len(regret)}
-        numbers = {"median": middle, "quantile 90 %": most, "median from": low, "median to": high}
-        rows.append(row | {key: round(float(v[at]), 4) for key, v in numbers.items()})
+    for i, k, n in np.ndindex(regret.shape[1:]):
+        row = {"people": PEOPLE[i], "competitor": tuple(PEERS)[k], "answers": asking.COUNTS[n]}
+        found = {name: round(float(v[i, k, n]), 4) for name, v in numbers.items()}
+        rows.append(row | {"draws": len(regret)} | found)
     return rows
 
 
-def write(path: Path, draws: Sequence[dict[str, np.ndarray]]) -> None:
-    """Write all draws and their table."""
-    head = {"people": PEOPLE, "strategies": tuple(PEERS), "counts": asking.COUNTS}
-    rows = table(np.array([d["regret"] for d in draws]))
-    write_spread(path, {**head, "table": rows, "seeds": list(range(len(draws)))}, draws)
+def show(rows: Sequence[dict[str, Any]]) -> None:
+    """Print the rows as a table in Markdown: median (its interval) / 90 % quantile, in percent."""
+    print("| people | competitor |" + "".join(f" {n} answers |" for n in asking.COUNTS))
+    print("|---|---|" + "---|" * len(asking.COUNTS))
+    for k in range(0, len(rows), len(asking.COUNTS)):
+        line = f"| {rows[k]['people']} | {rows[k]['competitor']} |"
+        for row in rows[k : k + len(asking.COUNTS)]:
+            middle, most, low, high = (100 * v for v in list(row.values())[-4:])
+            line += f" {middle:.1f} ({low:.1f} to {high:.1f}) / {most:.0f} |"
+        print(line)
 
 
 def main() -> None:
@@ -334,14 +332,18 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=OUT)
     parser.add_argument("--resume", action="store_true", help="keep the draws that OUT holds")
     options = parser.parse_args()
+    head: dict[str, Any] = {"people": PEOPLE, "strategies": tuple(PEERS), "counts": asking.COUNTS}
     draws = []
     if options.resume and options.out.exists():
         draws = [{"regret": regret} for regret in read_spread(options.out)["regret"]]
     with multiprocessing.get_context("spawn").Pool(options.jobs) as pool:
         for found in pool.imap(draw, range(len(draws), options.people)):
             draws.append(found)
-            write(options.out, draws)
+            rows = table(np.array([d["regret"] for d in draws]))
+            head |= {"table": rows, "seeds": list(range(len(draws)))}
+            write_spread(options.out, head, draws)
             print(f"{len(draws)} of {options.people}", flush=True)
+    show(table(np.array([d["regret"] for d in draws])))
 
 
 if __name__ == "__main__":
