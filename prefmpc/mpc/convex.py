@@ -13,7 +13,6 @@ from prefmpc._checks import instance, positive_int, single
 from prefmpc._units import cost_units, free_response, matters
 from prefmpc.models.networks import ICNNCost
 from prefmpc.models.quadratic import QuadraticCost, SumCost
-from prefmpc.mpc._cone import ParametricProgram
 from prefmpc.mpc._expressions import (
     check_cones,
     check_convex,
@@ -25,6 +24,7 @@ from prefmpc.mpc._expressions import (
 )
 from prefmpc.mpc._fixed import FixedCone, FixedRows
 from prefmpc.mpc._limits import per_unit
+from prefmpc.mpc._parametric import ParametricProgram
 from prefmpc.mpc.solution import (
     Controller,
     MPCSolution,

@@ -14,7 +14,7 @@ from prefmpc._checks import finite_array, instance, nonnegative, shaped, single
 from prefmpc._units import cost_units
 from prefmpc.models.networks import ICNNCost
 from prefmpc.models.quadratic import QuadraticCost, SumCost
-from prefmpc.mpc._cone import ConeSolution, ParametricProgram
+from prefmpc.mpc._cone import ConeSolution
 from prefmpc.mpc._expressions import (
     check_cones,
     check_convex,
@@ -22,6 +22,7 @@ from prefmpc.mpc._expressions import (
     stage_limits,
     weights,
 )
+from prefmpc.mpc._parametric import ParametricProgram
 from prefmpc.mpc.solution import MPCSolution
 from prefmpc.mpc.terminal import stage_constraints
 from prefmpc.preferences.trajectories import Trajectory
