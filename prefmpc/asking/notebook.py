@@ -151,7 +151,8 @@ def _widget(desk: Desk, config: dict[str, Any], notice: str, draw: str | None) -
             return f"ask: {len(desk.interview)} answers"
 
         def _repr_mimebundle_(self, **kwargs: Any) -> Any:
-            data, *rest = super()._repr_mimebundle_(**kwargs)
+            bundle: Any = super()._repr_mimebundle_(**kwargs)
+            data, *rest = bundle or ({},)
             return {**data, "image/png": picture(desk.interview, self.config)}, *rest
 
     widget = Ask(config=config, notice=notice)
