@@ -11,7 +11,7 @@ import scipy.integrate
 
 import prefmpc
 from prefmpc import Interview, LinearSystem, Polyhedron, Question, SeparableCost, Trajectory
-from prefmpc.asking.belief import Belief, Prior
+from prefmpc.asking.belief import LEVELS, Belief, Prior
 from prefmpc.asking.features import QuadraticFeatures, SeparableFeatures
 from prefmpc.asking.loops import gains, lqr_loops
 from prefmpc.asking.questions import information, informative_batch
@@ -316,3 +316,19 @@ def test_criteria_and_controllers_of_one_s_own_are_checked():
         cart(x0=lambda rng, count: np.zeros((3, 2))).next()
     with pytest.raises(ValueError, match="undo needs an answer"):
         cart().undo()
+
+
+def test_a_sharpness_whose_search_found_no_minimum_has_no_say(monkeypatch):
+    """A narrow valley can take more steps than there are: a guess must not win by its evidence."""
+    belief = Belief(QuadraticFeatures(np.eye(3), np.eye(2), True), Prior(2.0, 2.0, 0.5), 0.0)
+    rng, newton = np.random.default_rng(0), Belief._newton
+
+    def stuck(self, at, level, *data):
+        found = newton(self, at, level, *data)
+        return found._replace(curvature=-14.0, evidence=99.0) if level == LEVELS[9] else found
+
+    monkeypatch.setattr(Belief, "_newton", stuck)
+    laplace = belief.fit(rng.standard_normal((6, belief.p)), np.array([1.0, 0, 1, 0, 1, 1]))
+    assert laplace.success
+    assert laplace.weights[9] == 0.0
+    assert laplace.weights.sum() == pytest.approx(1.0)

@@ -21,6 +21,10 @@ LEVELS = np.linspace(-3.0, 3.0, 13)
 
 STEPS = 100
 TOLERANCE = 1e-9
+ROUGH = 1e-4
+"""A level whose search stopped with a larger decrement, or at no minimum, has no say: its evidence
+is not known. In a narrow valley `STEPS` may not be enough."""
+
 FLAT = 1e-3
 """No curvature counts as less than this share of the prior's."""
 
@@ -131,14 +135,17 @@ class Belief:
         minima = []
         at = np.zeros(self.p - 1)
         for level in LEVELS:
-            found = self._newton(at, level, *data, 0.0)
-            at = found.at
+            minimum = self._newton(at, level, *data, 0.0)
+            at = minimum.at
             if self.lapse is None:
-                found = self._newton(np.append(at, 0.0), level, *data, None)
+                minimum = self._newton(np.append(at, 0.0), level, *data, None)
             elif self.lapse:
-                found = self._newton(at, level, *data, self.lapse)
-            minima.append(found)
+                minimum = self._newton(at, level, *data, self.lapse)
+            minima.append(minimum)
         evidence = np.array([m.evidence for m in minima])
+        found = np.array([m.decrement <= ROUGH and m.curvature > 0 for m in minima])
+        if found.any():
+            evidence[~found] = -np.inf
         weights = np.exp(evidence - evidence.max())
         best = minima[int(np.argmax(weights))]
         return Laplace(

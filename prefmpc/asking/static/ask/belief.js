@@ -18,6 +18,7 @@
   const STEPS = 100;
   const TOLERANCE = 1e-9; // of the certificate; the search itself goes on to
   const POLISHED = 1e-18;
+  const ROUGH = 1e-4; // where a search stopped further from a minimum, its level has no say
   const FLAT = 1e-3; // no curvature counts as less than this share of the prior's
   const ROUNDS = 30;
 
@@ -74,7 +75,11 @@
       if (b.lapse === "estimate") return newton(b, [...at, 0], level, answers, null);
       return newton(b, at, level, answers, b.lapse);
     });
-    const evidence = minima.map((minimum) => minimum.evidence), most = Math.max(...evidence);
+    // A level whose search did not end in a minimum has no say: its evidence is not known.
+    const found = minima.map((m) => m.decrement <= ROUGH && m.curvature > 0);
+    const any = found.includes(true);
+    const evidence = minima.map((m, i) => (found[i] || !any ? m.evidence : -Infinity));
+    const most = Math.max(...evidence);
     const shares = evidence.map((e) => Math.exp(e - most));
     const total = shares.reduce((sum, share) => sum + share, 0);
     const k = evidence.indexOf(most), best = minima[k];
