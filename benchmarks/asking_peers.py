@@ -35,8 +35,9 @@ import jax
 import numpy as np
 from scipy.special import log_expit, ndtri
 
+from prefmpc._pytree import stacked
 from prefmpc.asking.loops import lqr_loops
-from prefmpc.asking.questions import entropy
+from prefmpc.asking.questions import information
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.preferences.pools import random_states
 from prefmpc.preferences.trajectories import Trajectory
@@ -100,9 +101,8 @@ class Tuning:
     def prefers(self, first: np.ndarray, second: np.ndarray) -> bool:
         """Ask whether the closed loop of the first is better."""
         x0 = random_states(RADIUS, key=self.rng, shape=(1,)) if self.x0 == "new" else self._first
-        costs = [self.cost(first), self.cost(second)]
-        stack = jax.tree.map(lambda *leaves: np.stack(leaves), *costs)
-        loops = lqr_loops(oscillating_masses(), stack, x0, LOOP_STEPS)
+        pair = stacked([self.cost(first), self.cost(second)])
+        loops = lqr_loops(oscillating_masses(), pair, x0, LOOP_STEPS)
         return bool(self.rng.uniform() < self.person.answers(loops[0], loops[1])[0])
 
 
@@ -249,9 +249,8 @@ def aprel(
         state = samples.mean(0) if ours else samples.mean(0) / np.linalg.norm(samples.mean(0))
         if count in counts:
             found.append(cost_of(np.log(weights(state) / scale)))
-        P = np.exp(log_expit(gap @ weights(samples).T))
-        information = entropy(P.mean(1)) - entropy(P).mean(1)
-        best = int(np.argmax(np.where(asked, -np.inf, information)))
+        P = np.exp(log_expit(weights(samples) @ gap.T))
+        best = int(np.argmax(np.where(asked, -np.inf, information(P))))
         asked[best] = True
         first, second = (pool[np.array([k[best]])] for k in (i, j))
         sign = 1.0 if rng.uniform() < person.answers(first, second)[0] else -1.0

@@ -9,6 +9,7 @@ it enters, and ``jit``, ``vmap``, ``grad`` and ``tree.map`` work on the same cla
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, Self, TypeVar
 
 import jax
@@ -22,6 +23,11 @@ def bypass_init(cls: type[T], **fields: Any) -> T:
     instance = object.__new__(cls)
     set_fields(instance, **fields)
     return instance
+
+
+def stacked(trees: Sequence[T]) -> T:
+    """Return trees of arrays that are alike as one, with a leading dimension."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *trees)
 
 
 def set_fields(instance: Any, **fields: Any) -> None:

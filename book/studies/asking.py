@@ -14,9 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from prefmpc._pytree import stacked
 from prefmpc._random import generator
 from prefmpc.asking.interview import Interview
-from prefmpc.asking.questions import stacked
 from prefmpc.learning.priors import WishartPrior, bryson
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.preferences.people import Preference, QuadraticPreference, logistic

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
 import numpy as np
 
+from prefmpc._pytree import stacked
 from prefmpc._random import generator
 from prefmpc.asking.interview import Interview
 from prefmpc.asking.loops import lqr_loops
@@ -126,7 +126,7 @@ def true_regret(person: Person, models: list[Any], x0: np.ndarray) -> np.ndarray
     system = oscillating_masses()
     known = QuadraticCost(person.Q, person.R)
     some = [known, *(known if model is None else model for model in models)]
-    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *some)
+    stack = stacked(some)
     mpc = closed_loops(system, stack, x0, horizon=QUADRATIC_HORIZON, steps=STEPS).trajectories
     values = [phi(runs, person.Q, person.R) for runs in (mpc, lqr_loops(system, stack, x0, 20))]
     value = np.stack([np.asarray(v).mean(axis=1) for v in values], axis=-1)
@@ -212,7 +212,7 @@ def limits_case(
         for way in WAYS:
             models += learn(careless, rule(), way, lapse=lapse)
     one_side = [model for way in WAYS for model in learn(ONE_SIDED, rule(), way)]
-    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *models, *one_side)
+    stack = stacked([*models, *one_side])
     runs = closed_loops(
         oscillating_masses(), stack, x0, horizon=QUADRATIC_HORIZON, steps=STEPS
     ).trajectories

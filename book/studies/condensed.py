@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from prefmpc._pytree import stacked
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.models.signals import Signal
 from prefmpc.mpc._batched_qp import SOLVED, solve
@@ -96,7 +97,7 @@ def weight_loops(
     count = len(weights)
     filled = [*weights, *[weights[-1]] * (-count % 8)]  # few shapes to compile
     problems = [input_problem(W, system.nx + system.nu, system.u_max) for W in filled]
-    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *problems)
+    stack = stacked(problems)
     x, u = (np.asarray(part)[:count] for part in _loops(system, stack, x0, steps))
     if not np.isfinite(u).all():
         raise RuntimeError("a closed loop met an MPC problem that was not solved")

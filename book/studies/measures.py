@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax
 import numpy as np
 
+from prefmpc._pytree import stacked
 from prefmpc._random import generator
 from prefmpc.evaluation import accuracy, regret, win_rate
 from prefmpc.learning.training import best_restart, fit
@@ -182,7 +182,7 @@ def measures_case(
 
     x0 = random_states(RADIUS, key=streams[4], shape=(loops,))
     ordered = [models[name] for name in MODELS if name in models]
-    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *ordered)
+    stack = stacked(ordered)
     runs = closed_loops(system, stack, x0, horizon=QUADRATIC_HORIZON, steps=30)
     best = BatchedMPC(system, models["From Π"], 30).solve(x0)
     if not (runs.solved.all() and best.success):

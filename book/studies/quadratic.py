@@ -6,9 +6,9 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import numpy as np
 
+from prefmpc._pytree import stacked
 from prefmpc._random import generator
 from prefmpc.evaluation import accuracy
 from prefmpc.learning.training import FitResult, Selection, best_restart, fit
@@ -120,7 +120,7 @@ def stacked_loops(
 
     Raises a RuntimeError if an MPC problem on the way is not solved.
     """
-    stack = jax.tree.map(lambda *leaves: np.stack(leaves), *models)
+    stack = stacked(models)
     return solved(closed_loops(system, stack, x0, horizon=horizon, steps=steps))
 
 

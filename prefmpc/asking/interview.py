@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from prefmpc._checks import function, nonnegative, positive_int
+from prefmpc._pytree import stacked
 from prefmpc.asking.answers import Answer, comparisons_of, label_of, line_of
 from prefmpc.asking.belief import Laplace
 from prefmpc.asking.criteria import Criterion
@@ -18,7 +19,7 @@ from prefmpc.asking.log import Log
 from prefmpc.asking.loops import Controller
 from prefmpc.asking.making import State, make, state_after
 from prefmpc.asking.options import Options
-from prefmpc.asking.questions import Question, stacked
+from prefmpc.asking.questions import Question
 from prefmpc.asking.regret import Consistency, Regret, consistency_of, regret_of
 from prefmpc.asking.sources import Pool
 from prefmpc.learning.convex import MapResult, fit_map

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from prefmpc._checks import real_array
+from prefmpc._pytree import stacked
 from prefmpc.asking.answers import Answer
 from prefmpc.asking.belief import Belief, Laplace
 from prefmpc.asking.criteria import CRITERIA
@@ -18,7 +19,6 @@ from prefmpc.asking.questions import (
     information,
     informative_batch,
     probability,
-    stacked,
 )
 from prefmpc.asking.sources import Shown, check_pool, loops_shown, pool_shown
 from prefmpc.preferences.trajectories import Trajectory

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from typing import NamedTuple
 
-import jax
 import numpy as np
 from scipy.special import entr, expit
 
@@ -129,8 +128,3 @@ def informative_batch(P: np.ndarray, allowed: np.ndarray, size: int) -> list[int
             patterns = patterns[np.argsort(-patterns.sum(axis=1), kind="stable")[:PATTERNS]]
             patterns = patterns / patterns.sum(axis=0).mean()
     return chosen
-
-
-def stacked(trajectories: list[Trajectory]) -> Trajectory:
-    """Return single trajectories as one with a leading dimension."""
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *trajectories)

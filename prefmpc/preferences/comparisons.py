@@ -13,7 +13,7 @@ from jax.typing import ArrayLike
 
 from prefmpc._checks import finite_array, flag, function, indices, positive_int
 from prefmpc._files import atomic_write
-from prefmpc._pytree import set_fields
+from prefmpc._pytree import set_fields, stacked
 from prefmpc._random import generator
 from prefmpc.preferences.logs import answers_of, read
 from prefmpc.preferences.people import Preference, asked
@@ -250,7 +250,7 @@ def compared(first: list[Trajectory], second: list[Trajectory], labels: np.ndarr
     if not given.size:
         raise ValueError("comparisons need at least one answer, there is none")
     sides = [first[i] for i in given] + [second[i] for i in given]
-    both = jax.tree.map(lambda *leaves: np.stack(leaves), *sides)
+    both = stacked(sides)
     n = given.size
     return Comparisons(both, np.arange(n), np.arange(n, 2 * n), labels[given])
 

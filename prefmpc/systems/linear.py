@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 import scipy.linalg
 from jax.typing import ArrayLike
@@ -21,7 +20,7 @@ from prefmpc._checks import (
     single,
 )
 from prefmpc._matrices import psd_matrix
-from prefmpc._pytree import Stack, register_pytree, set_fields
+from prefmpc._pytree import Stack, register_pytree, set_fields, stacked
 from prefmpc._units import cost_units
 
 if TYPE_CHECKING:
@@ -125,7 +124,7 @@ class LinearSystem(System, Stack):
         kinds = {(s.A.shape, s.B.shape, s.C.shape, s.dt) for s in systems}
         if len(kinds) > 1:
             raise ValueError(f"systems must agree in all shapes and in dt, got {sorted(kinds)}")
-        return jax.tree.map(lambda *leaves: np.stack(leaves), *systems)
+        return stacked(systems)
 
     @property
     def batch_shape(self) -> tuple[int, ...]:
