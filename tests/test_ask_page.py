@@ -53,14 +53,6 @@ def page() -> Iterator[Page]:
     page.close()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _to_the_last_digit() -> Iterator[None]:
-    """Let the library go on, as the page does, when its certificate is good enough."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(belief, "TOLERANCE", 1e-18)
-        yield
-
-
 def options(**given: Any) -> Options:
     defaults = {
         name: parameter.default
@@ -114,7 +106,7 @@ def sessions(page: Page) -> list[tuple[Session, Any, Any]]:
 def test_weights_and_their_deviations(sessions: list[tuple[Session, Any, Any]]) -> None:
     for _, laplace, found in sessions:
         assert found["success"]
-        assert laplace.success or laplace.decrement < 1e-12
+        assert laplace.success
         np.testing.assert_allclose(found["eta"], laplace.eta, **CLOSE)
         np.testing.assert_allclose(found["lapse"], laplace.lapse, **CLOSE)
         np.testing.assert_allclose(found["curvature"], laplace.curvature, **CLOSE)
@@ -123,9 +115,7 @@ def test_weights_and_their_deviations(sessions: list[tuple[Session, Any, Any]]) 
         odds = [np.array(weights)[counts] for weights in (found["weights"], laplace.weights)]
         np.testing.assert_allclose(*(weights / weights.max() for weights in odds), **CLOSE)
         np.testing.assert_allclose(np.array(found["at"])[counts], laplace.at[counts], **CLOSE)
-        ours, theirs = np.array(found["roots"])[counts], laplace.roots[counts]
-        covariance = ours @ ours.swapaxes(1, 2), theirs @ theirs.swapaxes(1, 2)
-        np.testing.assert_allclose(*covariance, **CLOSE)
+        np.testing.assert_allclose(np.array(found["roots"])[counts], laplace.roots[counts], **CLOSE)
 
 
 def test_gains_and_closed_loops(page: Page, sessions: list[tuple[Session, Any, Any]]) -> None:

@@ -111,12 +111,17 @@ def test_a_lapse_rate_is_estimated():
         coin = rng.uniform(size=2)
         return PERSON(first, second) if coin[0] > 0.3 else np.array([float(coin[1] < 0.5)])
 
-    careless, careful = cart(lapse="estimate"), cart(lapse="estimate")
-    careless.answer_with(lapsing, 40)
-    careful.answer_with(PERSON, 40)
-    assert careful.certificate.lapse < 0.03 < 0.06 < careless.certificate.lapse
-    assert careful.certificate.success
-    assert careless.certificate.success
+    rates = []
+    for key in range(3):
+        interviews = [cart(lapse="estimate", key=key) for _ in range(2)]
+        for interview, person in zip(interviews, (lapsing, PERSON), strict=True):
+            interview.answer_with(person, 40)
+            assert interview.certificate.success
+        rates.append([interview.certificate.lapse for interview in interviews])
+    careless, careful = np.array(rates).T
+    assert (careful < 0.03).all()
+    assert (careless > careful).all()
+    assert careless.mean() > 1.5 * careful.mean()
     assert cart(lapse=0.1).certificate.lapse == 0.1
 
 

@@ -21,12 +21,19 @@ LEVELS = np.linspace(-3.0, 3.0, 13)
 
 STEPS = 100
 TOLERANCE = 1e-9
+"""Of the certificate; the search itself goes on to `POLISHED`, where rounding ends it."""
+
+POLISHED = 1e-18
 ROUGH = 1e-4
 """A level whose search stopped with a larger decrement, or at no minimum, has no say: its evidence
 is not known. In a narrow valley `STEPS` may not be enough."""
 
 FLAT = 1e-3
-"""No curvature counts as less than this share of the prior's."""
+"""No curvature counts as less than this share of the prior's for a Newton step."""
+
+WIDE = 0.25
+"""Nor less than this for a Gaussian: it is nowhere wider than twice the prior, since answers that
+say nothing of a direction leave what was known before."""
 
 SLICES = 5
 """Updates of every sample that starts from Laplace's Gaussian."""
@@ -185,7 +192,7 @@ class Belief:
             turned = vectors.T @ gradient
             size = np.maximum(np.abs(values), FLAT)
             decrement = float(0.5 * turned @ (turned / size))
-            if decrement <= TOLERANCE and values[0] > 0:
+            if decrement <= POLISHED and values[0] > 0:
                 break
             step = -vectors @ (turned / size)
             t = min(1.0, 3.0 / np.abs(step).max())
@@ -197,10 +204,12 @@ class Belief:
             else:
                 break
             at, now = at + t * step, trial
-        size = np.maximum(values, FLAT)
+        size = np.maximum(values, WIDE)
         evidence = -now - 0.5 * np.log(size).sum() - 0.5 * level**2
         decrement = decrement if np.isfinite(now) else np.inf
-        return _Minimum(at, vectors / np.sqrt(size), float(evidence), decrement, float(values[0]))
+        # The symmetric root, since the signs of eigenvectors are arbitrary.
+        root = vectors / np.sqrt(size) @ vectors.T
+        return _Minimum(at, root, float(evidence), decrement, float(values[0]))
 
     def _energy(
         self, at: np.ndarray, level: Any, gap: np.ndarray, labels: np.ndarray, lapse: float | None

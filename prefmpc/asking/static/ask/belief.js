@@ -19,7 +19,8 @@
   const TOLERANCE = 1e-9; // of the certificate; the search itself goes on to
   const POLISHED = 1e-18;
   const ROUGH = 1e-4; // where a search stopped further from a minimum, its level has no say
-  const FLAT = 1e-3; // no curvature counts as less than this share of the prior's
+  const FLAT = 1e-3; // no curvature counts as less than this share of the prior's for a step,
+  const WIDE = 0.25; // nor less than this for a Gaussian: nowhere is it wider than twice the prior
   const ROUNDS = 30;
 
   const logistic = (z) => (z >= 0 ? 1 / (1 + Math.exp(-z)) : Math.exp(z) / (1 + Math.exp(z)));
@@ -159,11 +160,13 @@
       }
       if (!found) break;
     }
-    const size = values.map((value) => Math.max(value, FLAT));
+    const size = values.map((value) => Math.max(value, WIDE));
     const evidence = -now - 0.5 * size.reduce((sum, s) => sum + Math.log(s), 0) - 0.5 * level ** 2;
+    // The symmetric root, since the signs of eigenvectors are arbitrary.
+    const scaled = vectors.map((row) => row.map((value, i) => value / Math.sqrt(size[i])));
     return {
       at, evidence, decrement: Number.isFinite(now) ? decrement : Infinity, curvature: values[0],
-      root: vectors.map((row) => row.map((value, i) => value / Math.sqrt(size[i]))),
+      root: scaled.map((row) => times(vectors, row)),
     };
   }
 
