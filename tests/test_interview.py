@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import control
 import jax
 import numpy as np
 import pytest
@@ -182,6 +183,33 @@ def test_one_in_eight_is_asked_again_with_sides_swapped():
     seen = interview.consistency
     assert (seen.repeats, seen.equal) == (4, 1.0)
     assert 0.2 < seen.first < 0.8
+
+
+def test_regret_is_that_of_the_loops_of_who_knows_the_weights():
+    interview = cart(repeat_every=0)
+    interview.answer_with(PERSON, 5)
+    options, found = interview._options, interview.regret
+    x0 = options.states.draw(12, options.rng(0, 2))
+    samples = [interview.posterior[np.array(i)] for i in range(150)]
+    loops = []
+    for model in (interview.model, *samples):
+        K = control.dlqr(CART.A, CART.B, model.Q, model.R)[0]
+        loops.append(prefmpc.rollout(CART, x0, K, options.steps, saturate=True))
+    ours, best = (
+        np.array([prefmpc.phi(T, m.Q, m.R).mean() for T, m in zip(runs, samples, strict=True)])
+        for runs in ([loops[0]] * 150, loops[1:])
+    )
+    np.testing.assert_allclose(found.values, np.maximum(ours / best - 1, 0), rtol=1e-6, atol=1e-9)
+
+
+def test_a_bound_leaves_room_for_the_error_of_the_samples():
+    regret = prefmpc.asking.regret.Regret(np.arange(101) / 1000)
+    assert regret.quantile(0.9) == pytest.approx(0.09)
+    assert regret.bound(0.9) == pytest.approx(0.09 + 1.645 * np.sqrt(0.09 / 101) / 10)
+    assert regret.bound(0.999) == pytest.approx(0.1)
+    assert regret.stop(0.095)
+    assert not regret.stop(0.0945)
+    assert str(regret) == "5 % (median), at most 9.5 % with probability 0.9"
 
 
 def test_a_habit_of_answering_first_shows():

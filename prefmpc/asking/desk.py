@@ -94,7 +94,8 @@ class Desk:
 
     def _progress(self) -> dict[str, Any]:
         interview, consistency = self.interview, self.interview.consistency
-        bound, median = (interview.regret.quantile(q) for q in (self._limits["certain"], 0.5))
+        regret = interview.regret
+        bound, median = regret.bound(self._limits["certain"]), regret.quantile(0.5)
         repeats = consistency.repeats
         return {
             "count": len(interview),
