@@ -268,6 +268,46 @@ def test_mpc_keeps_the_constraints_of_what_is_shown():
     assert interview.regret.quantile() > 0
 
 
+@pytest.mark.parametrize("controller", ["lqr", "mpc"])
+def test_loops_reach_set_points_within_the_limits(controller):
+    goals = [prefmpc.steady_state(CART, [0.6, 0.0]), prefmpc.steady_state(CART, [-1.0, 0.0])]
+    limits = Polyhedron.box([-2, -0.4, -1], [2, 0.4, 1]) if controller == "mpc" else None
+    options = {"reference": goals, "controller": controller, "constraints": limits}
+    interview = cart(x0=[[0.2, 0.0]], steps=25, **options)
+    interview.answer_with(PERSON, 4)
+    for question in interview.questions:
+        for side in (question.first, question.second):
+            np.testing.assert_allclose(side.x[0], [0.2, 0.0])
+            np.testing.assert_allclose(side.x[1:], CART.step(side.x[:-1], side.u), atol=1e-12)
+            assert np.abs(side.u).max() <= 1 + 1e-9
+            if limits:
+                assert np.abs(side.x[:, 1]).max() <= 0.4 + 1e-6
+        assert np.array_equal(question.first.x_r, question.second.x_r)
+        assert question.first.x_r[0] in (0.6, -1.0)
+    cost = prefmpc.QuadraticCost(np.diag([4.0, 0.2]), [[0.5]])
+    starts = np.tile([0.2, 0.0], (3, 1))
+    runs = interview._options.loops(jax.tree.map(lambda leaf: leaf[None], cost), starts)
+    np.testing.assert_array_equal(runs.x_r[0], [goals[i].x for i in (0, 1, 0)])
+    assert np.abs(runs.x[0, :, -1] - runs.x_r[0]).max() < 0.5
+    if controller == "lqr":
+        K = control.dlqr(CART.A, CART.B, cost.Q, cost.R)[0]
+        wanted = np.clip((runs.x_r[0, :, None] - runs.x[0, :, :-1]) @ K.T, -1, 1)
+        np.testing.assert_allclose(runs.u[0], wanted, atol=1e-9)
+    assert interview.regret.quantile() >= 0
+
+
+def test_a_set_point_goes_with_what_makes_loops_to_it():
+    goal = prefmpc.steady_state(CART, [0.6, 0.0])
+    with pytest.raises(ValueError, match="reference must be a steady state"):
+        cart(reference=prefmpc.SteadyState(goal.x, goal.u + 0.1, goal.y))
+    with pytest.raises(ValueError, match="reference must be a sequence of at least one"):
+        cart(reference=[])
+    with pytest.raises(ValueError, match="reference must be None with a pool"):
+        cart(reference=goal, controller=lambda models, x0: None)
+    with pytest.raises(ValueError, match="prior must be given"):
+        Interview(CART, x0=[1.0, 0.5], key=0, reference=goal)
+
+
 def test_the_result_is_fit_map_of_the_same_answers():
     interview = cart()
     interview.answer_with(PERSON, 6)

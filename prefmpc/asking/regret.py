@@ -83,7 +83,7 @@ def regret_of(present: np.ndarray, samples: np.ndarray, options: Options) -> Reg
     The x(0) are a function of the key alone, and the same for all.
     """
     features = options.features
-    x0 = options.states.draw(STATES, options.rng(0, 2))
+    x0 = options.starts(STATES, options.rng(0, 2))
     runs = options.loops(features.model(np.concatenate([present[None], samples])), x0)
     phi = np.asarray(features(runs))  # (1 + S, m, p)
     reached = np.isfinite(phi[0]).all(axis=-1)

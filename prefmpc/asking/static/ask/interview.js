@@ -170,7 +170,7 @@
       prior: { Q: diag(Q), R: diag(R), strength: 1 },
       x0: options.radius, key, structure: "diagonal", spread: options.spread,
       sharpness: options.sharpness, coupling: options.coupling, steps: options.steps,
-      controller: "lqr", horizon: 10, constraints: null, pool: null, choose: "information",
+      controller: "lqr", reference: null, horizon: 10, constraints: null, pool: null, choose: "information",
       lapse: options.lapse, repeat_every: options.repeatEvery, samples: options.samples,
     };
   }
