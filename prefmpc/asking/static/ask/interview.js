@@ -19,7 +19,7 @@
   const DEFAULTS = Object.freeze({
     spread: 2, sharpness: 2, coupling: 0.5, steps: 20, lapse: 0, repeatEvery: 8,
     samples: 150, // draws from the posterior, each moved so often:
-    slices: 5,
+    slices: 15,
     controllers: 12, // so many of them make loops, from so many states, for one question
     states: 12,
     level: 0.02, // enough: the regret is at most this with this probability
