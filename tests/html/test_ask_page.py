@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -145,6 +146,10 @@ def a_session(seed: int) -> tuple[float, int, dict[str, Any]]:
         browser.click(".ask-save")
         file = browser.downloads / "answers.jsonl"
         browser.until(lambda: written(file), "the download")
+        said = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+        blind = [line for line in said if "blind" in line]
+        assert len(blind) == 10
+        assert sum((line["learned"] == "first") == line["answer"] for line in blind) == wins
         assert told(browser) == []
         assert [r for r in browser.requests if not r.startswith(("file:", "data:", "blob:"))] == []
         assert browser("visit.shifts") < 0.02
