@@ -346,6 +346,7 @@ def test_every_answer_is_there_once_and_in_order_after_50_kills(tmp_path: Path) 
         (ask, {"names": ["a"]}, "names must hold a text for each of 2 states and 1 inputs"),
         (ask, {"units": [0, 1, 2]}, "units must hold a text"),
         (ask, {"draw": 3}, "draw must be a text"),
+        (ask, {"draw": "lane"}, "'lane' shows 4 states and 2 inputs, the plant has 2 and 1"),
         (ask, {"who": ""}, "who must be a text"),
         (ask, {"who": "Anna"}, "log must be given"),
         (ask, {"level": -1}, "level must be"),

@@ -435,6 +435,8 @@ def test_a_file_is_replaced_on_demand_only(tmp_path: Path) -> None:
         ({"units": [1, 2, 3]}, "units must hold a text"),
         ({"names": list("abcde")}, "units must be one for each of 5 names"),
         ({"most": 0}, "most must be a whole number"),
+        ({"draw": "() => null"}, "draw must be one of"),
+        ({"draw": "pendulum"}, "'pendulum' shows 4 states and 1 inputs, the plant has 2 and 1"),
     ):
         with pytest.raises(ValueError, match=words):
             own_plant().to_html(path, overwrite=True, **{"units": ["m", "m/s", "N"], **wrong})

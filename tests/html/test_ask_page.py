@@ -20,6 +20,7 @@ from prefmpc import (
     QuadraticCost,
     bryson,
     cart_pendulum,
+    kinematic_bicycle,
     oscillating_masses,
     random_states,
 )
@@ -270,7 +271,15 @@ def of_the_pendulum() -> tuple[Interview, dict[str, Any]]:
     plant = cart_pendulum().linearise(np.zeros(4), np.zeros(1))
     prior = bryson([1, 0.3, 1, 1], [10])
     interview = Interview(plant, prior, x0=[0.5, 0.1, 0.1, 0.1], steps=60, key=0)
-    return interview, {"names": PENDULUM, "units": PENDULUM_UNITS, "title": "The pendulum"}
+    shown = {"names": PENDULUM, "units": PENDULUM_UNITS, "title": "The pendulum"}
+    return interview, {**shown, "draw": "pendulum"}
+
+
+def of_the_car() -> tuple[Interview, dict[str, Any]]:
+    plant = kinematic_bicycle().linearise(np.array([0, 0, 0, 20.0]), np.zeros(2))
+    prior = bryson([1, 0.1, 0.1, 1], [0.4, 2])
+    interview = Interview(plant, prior, x0=[[3.5, 0, 0, 0], [3.5, 0.02, 0, 1]], steps=25, key=0)
+    return interview, {"title": "A lane change", "draw": "lane"}
 
 
 def of_my_own() -> tuple[Interview, dict[str, Any]]:
@@ -279,8 +288,13 @@ def of_my_own() -> tuple[Interview, dict[str, Any]]:
     return interview, {"names": EVIL, "units": EVIL, "title": f"{EVIL[0]} </title> 😀"}
 
 
+def where(page: Browser) -> Any:
+    """Return where all that a drawing moves is."""
+    return page("[...document.querySelectorAll('.ask-scene g')].map((g) => g.outerHTML).join()")
+
+
 @pytest.mark.parametrize("width", [390, 1280])
-@pytest.mark.parametrize("make", [of_the_pendulum, of_my_own])
+@pytest.mark.parametrize("make", [of_the_pendulum, of_the_car, of_my_own])
 def test_a_file_of_its_own(tmp_path: Path, make: Any, width: int) -> None:
     jax.config.update("jax_enable_x64", True)
     interview, shown = make()
@@ -294,7 +308,12 @@ def test_a_file_of_its_own(tmp_path: Path, make: Any, width: int) -> None:
         assert page("document.querySelectorAll('main > p b').length") == 1
         assert page("document.documentElement.dataset.theme") == "dark"
         assert page("document.documentElement.scrollWidth") <= width
-        assert shown["names"][1] in page("document.querySelector('.ask').textContent")
+        name = shown["names"][1] if "names" in shown else "x2"
+        assert name in page("document.querySelector('.ask').textContent")
+        if "draw" in shown:
+            before = where(page)
+            page.until(lambda: where(page) != before, "something moves")
+            assert "NaN" not in where(page)
         for number in range(6):
             before = count(page)
             page.press(("ArrowLeft", "ArrowRight", "ArrowDown")[number % 3])
@@ -319,5 +338,6 @@ def test_a_file_of_its_own(tmp_path: Path, make: Any, width: int) -> None:
         page.until(lambda: count(page).startswith("Pair 1 "), "the blind test")
         # Nothing but the file itself was read, and its policy let nothing else run.
         assert {r for r in page.requests if not r.startswith("blob:")} == {path.as_uri()}
+        assert page("document.querySelectorAll('.ask-scene').length") == 2 * ("draw" in shown)
         page("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=\"spoiled = 1\">')")
         assert page("typeof spoiled") == "undefined"
