@@ -2,6 +2,7 @@
 # make test    everything that must hold before a change is kept
 # make quick   lint, types and a few fast tests of every module, in a minute
 # make test-studies   more of each study's first draw again than `make test` does
+# make test-lab   the widget that asks, in a real JupyterLab: needs a Chromium, takes a minute
 # make lab     JupyterLab on the notebooks
 # make notebooks   execute all notebooks again, in place
 # make bench   the times of the library beside its peers', in 8 minutes
@@ -34,10 +35,10 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 # Dozens of processes import the same modules: each is compiled once, whatever the shell says.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: help book test quick test-studies lab notebooks bench clean lint types unit nbval unit-and-nbval html html-strict test-html
+.PHONY: help book test quick test-studies test-lab lab notebooks bench clean lint types unit nbval unit-and-nbval html html-strict test-html
 
 help:
-	@sed -n 's/^# \{0,1\}//p' Makefile | sed -n '1,11p'
+	@sed -n 's/^# \{0,1\}//p' Makefile | sed -n '1,12p'
 
 # The list is complete, so nothing has to be resolved. The last line but one compiles what all
 # notebooks import (pip would compile everything), and builds matplotlib's font cache, which would
@@ -93,6 +94,9 @@ quick: $(STAMP)
 
 test-studies: $(STAMP)
 	@PREFMPC_STUDIES=all $(PYTEST) $(wildcard tests/test_*_study.py tests/test_*_studies.py)
+
+test-lab: $(LAB_STAMP)
+	@PREFMPC_LAB=1 $(PYTEST) -n 0 tests/html/test_lab.py
 
 lint: $(STAMP)
 	@$(BIN)/ruff check --quiet .

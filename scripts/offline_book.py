@@ -32,7 +32,15 @@ def drop_duplicates(app: Any, pagename: str, templatename: str, context: Any, do
         context[kind][:] = kept
 
 
+def name_by_text(app: Any, pagename: str, templatename: str, context: Any, doctree: Any) -> None:
+    """Let what opens a folded cell be called what stands on it, for who hears or speaks it."""
+    if "body" in context:
+        label = ' aria-label="Toggle hidden content"'
+        context["body"] = context["body"].replace(f"<summary{label}>", "<summary>")
+
+
 def setup(app: Any) -> dict[str, bool]:
     app.connect("config-inited", use_svg_math, priority=900)
     app.connect("html-page-context", drop_duplicates, priority=0)
+    app.connect("html-page-context", name_by_text)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -306,7 +306,10 @@ def valid_calls():
         "Interview.finished": (interview.finished, {"level": 0.02, "q": 0.9, "least_gain": 0.0}),
         "Interview.to_html": (
             shown,
-            {"title": "Mine", "names": names, "units": names, "most": 30, "overwrite": False},
+            {
+                **{"title": "Mine", "names": names, "units": names, "draw": None},
+                **{"most": 30, "overwrite": False},
+            },
         ),
         "ask": (
             asked,

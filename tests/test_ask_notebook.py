@@ -15,7 +15,15 @@ import numpy as np
 import pytest
 from test_interview import CART, PERSON, PRIOR, cart, same
 
-from prefmpc import Interview, NonlinearSystem, SeparableCost, Trajectory, ask, oscillating_masses
+from prefmpc import (
+    Comparisons,
+    Interview,
+    NonlinearSystem,
+    SeparableCost,
+    Trajectory,
+    ask,
+    oscillating_masses,
+)
 from prefmpc.asking.desk import Desk
 from prefmpc.asking.files import resume
 
@@ -137,6 +145,40 @@ def test_the_blind_test_is_of_the_present_weights_against_the_priors(tmp_path: P
             other = pair["second" if pair["learned"] == "first" else "first"]
             u = np.clip(-centre @ other["x"][0], CART.u_min, CART.u_max)
             np.testing.assert_allclose(other["u"][0], u, atol=1e-9)
+
+
+def test_what_is_said_of_the_blind_test_is_in_the_log(tmp_path: Path) -> None:
+    path = tmp_path / "answers.jsonl"
+    interview = cart(log=path)
+    interview.answer_with(PERSON, 4)
+    pairs = call(desk_of(interview), "trial", count=3)
+    judged: list[Any] = [(0, "first"), (1, "second"), (1, None), (1, 0.5)]
+    for pair, value in judged:
+        given = {"count": 3, "pair": pair, "number": 4, "value": value}
+        assert call(desk_of(interview), "judge", **given) == 3
+    lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()[5:]]
+    assert [(line["blind"], line["answer"]) for line in lines] == [
+        (0, 1),
+        (1, 0),
+        (1, None),
+        (1, 0.5),
+    ]
+    for line in lines:
+        assert line["number"] == 4
+        assert {name: line[name] for name in pairs[0]} == pairs[line["blind"]]
+    before = path.read_text("utf-8")
+    for wrong in ({"number": 3}, {"pair": 3}, {"count": 0}, {"value": 0.4}, {"value": "skip"}):
+        given = {"count": 3, "pair": 0, "number": 4, "value": "first", **wrong}
+        assert isinstance(call(desk_of(interview), "judge", **given), ValueError)
+    assert path.read_text("utf-8") == before
+    # Nothing is learned from it, and the interview goes on.
+    assert len(Comparisons.load(path)) == 4
+    resumed = Interview.load(path)
+    assert same(resumed.next(), interview.next())
+    resumed.answer("first")
+    again = cart()
+    assert resume(again, path, False) == 0
+    assert len(again) == 5
 
 
 # ---- the log ----
@@ -304,6 +346,7 @@ def test_every_answer_is_there_once_and_in_order_after_50_kills(tmp_path: Path) 
         (ask, {"names": ["a"]}, "names must hold a text for each of 2 states and 1 inputs"),
         (ask, {"units": [0, 1, 2]}, "units must hold a text"),
         (ask, {"draw": 3}, "draw must be a text"),
+        (ask, {"draw": "lane"}, "'lane' shows 4 states and 2 inputs, the plant has 2 and 1"),
         (ask, {"who": ""}, "who must be a text"),
         (ask, {"who": "Anna"}, "log must be given"),
         (ask, {"level": -1}, "level must be"),

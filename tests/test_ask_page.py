@@ -297,6 +297,24 @@ def test_the_blind_test(page: Page) -> None:
     assert (found["wins"], found["count"], found["ties"]) == (2, 3, 1)
 
 
+def test_the_blind_test_is_in_the_downloaded_log(page: Page, tmp_path: Path) -> None:
+    done = session(page, 2, 12)
+    answers = ["first", "second", 0.5]
+    lines = page("ask.blind.lines(pairs, answers, 11)", pairs=done["trial"], answers=answers)
+    path = tmp_path / "answers.jsonl"
+    path.write_text(done["log"] + lines, encoding="utf-8")
+    read = [json.loads(line) for line in lines.splitlines()]
+    assert [(line["blind"], line["answer"]) for line in read] == [(0, 1), (1, 0), (2, 0.5)]
+    assert [{**pair, "number": 11} for pair in done["trial"][:3]] == [
+        {name: line[name] for name in ("first", "second", "learned", "number")} for line in read
+    ]
+    alone = tmp_path / "alone.jsonl"
+    alone.write_text(done["log"], encoding="utf-8")
+    found, without = (Interview.load(file, append=False) for file in (path, alone))
+    assert np.array_equal(found.labels, without.labels, equal_nan=True)
+    assert len(Comparisons.load(path)) == len(Comparisons.load(alone))
+
+
 def test_random_numbers(page: Page) -> None:
     code = """{
       const one = ask.random.random(7, 1), other = ask.random.random(7, 1);
@@ -409,6 +427,8 @@ def test_a_file_is_replaced_on_demand_only(tmp_path: Path) -> None:
         ({"units": [1, 2, 3]}, "units must hold a text"),
         ({"names": list("abcde")}, "units must be one for each of 5 names"),
         ({"most": 0}, "most must be a whole number"),
+        ({"draw": "() => null"}, "draw must be one of"),
+        ({"draw": "pendulum"}, "'pendulum' shows 4 states and 1 inputs, the plant has 2 and 1"),
     ):
         with pytest.raises(ValueError, match=words):
             own_plant().to_html(path, overwrite=True, **{"units": ["m", "m/s", "N"], **wrong})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import json
 import random
 from collections.abc import Callable
@@ -108,6 +109,36 @@ def test_a_line_edited_by_hand_is_named_with_its_field(
     for load in (Comparisons.load, Interview.load):
         with pytest.raises(ValueError, match=f"line 3: {words}"):
             load(path)
+
+
+def test_an_answer_to_a_blind_test_is_checked_and_passed_over(path: Path) -> None:
+    lines = [json.loads(line) for line in path.read_text("utf-8").splitlines()]
+    said = {"blind": 0, "number": 3, "answer": 0.5, "learned": "first"}
+    said |= {side: copy.deepcopy(lines[1]["question"][side]) for side in ("first", "second")}
+    lines[3:3] = [said, {**copy.deepcopy(said), "answer": None}]
+
+    def write(changed: Any) -> None:
+        path.write_text("".join(json.dumps(line) + "\n" for line in changed), encoding="utf-8")
+
+    write(lines)
+    assert len(Comparisons.load(path)) == 4
+    assert len(Interview.load(path, append=False)) == 5
+    wrong: list[tuple[Change, str]] = [
+        (at("blind", value=-1), "blind must be a whole number, got -1"),
+        (without("number"), "number is missing"),
+        (at("answer", value=2), r"answer must lie in \[0, 1\], got 2"),
+        (without("answer"), "answer is missing"),
+        (at("learned", value="third"), "learned must be"),
+        (without("second"), "second is missing"),
+        (at("first", "x", 0, 0, value=NAN), "first.x must be finite"),
+    ]
+    for change, words in wrong:
+        changed = copy.deepcopy(lines)
+        change(changed[3])
+        write(changed)
+        for load in (Comparisons.load, Interview.load):
+            with pytest.raises(ValueError, match=f"line 4: {words}"):
+                load(path)
 
 
 @pytest.mark.parametrize(

@@ -57,6 +57,19 @@ def line_of(count: int, answer: Answer) -> dict[str, Any]:
     }
 
 
+def judgement_of(count: int, pair: int, label: float, sides: dict[str, Any]) -> dict[str, Any]:
+    """Return the line of a log for an answer to a pair of a blind test after so many answers.
+
+    Parameters
+    ----------
+    label : float
+        P(first preferred), NaN if the answer is taken back.
+    sides : dict
+        Trajectories ``first`` and ``second``, and which one is ``learned``.
+    """
+    return {"blind": pair, "number": count, "answer": None if np.isnan(label) else label, **sides}
+
+
 def replayed(
     lines: list[dict[str, Any]], path: str | os.PathLike[str]
 ) -> tuple[list[Answer], tuple[int, int]]:

@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 from prefmpc._checks import is_whole
+from prefmpc.asking.answers import judgement_of, label_of
 from prefmpc.asking.interview import Interview
 from prefmpc.asking.log import to_json
 from prefmpc.models.quadratic import QuadraticCost
@@ -57,6 +58,7 @@ class Desk:
             "undo": self._undo,
             "progress": lambda message: self._progress(),
             "trial": self._trial,
+            "judge": self._judge,
             "log": lambda message: self.interview._text().decode(),
         }
 
@@ -113,10 +115,27 @@ class Desk:
 
     def _trial(self, message: dict[str, Any]) -> Any:
         """Return pairs of closed loops, one of the present σ and one of the prior's centre."""
-        count: Any = message.get("count")
-        if not is_whole(count) or not 1 <= count <= 100:
-            raise ValueError(f"count must be a whole number from 1 to 100, got {count!r:.50}")
-        options, n = self.interview._options, len(self.interview)
+        return self._pairs(_whole(message, "count", 1, 100))
+
+    def _judge(self, message: dict[str, Any]) -> Any:
+        """Write down what is said of a pair of the blind test, None: it is taken back."""
+        value: Any = message.get("value")
+        pair = _whole(message, "pair", 0, 99)
+        pairs = self._pairs(_whole(message, "count", pair + 1, 100))
+        if (number := _known(message)) != len(self.interview):
+            raise ValueError(f"this blind test is of {number} answers, there are others by now")
+        if not (value in ("first", "second", None) or value == 0.5):
+            raise ValueError(f"value must be an answer to a pair, got {value!r:.50}")
+        if self.interview._log is not None:
+            self.interview._log.append(judgement_of(number, pair, label_of(value), pairs[pair]))
+        return len(pairs)
+
+    def _pairs(self, count: int) -> list[dict[str, Any]]:
+        interview, n = self.interview, len(self.interview)
+        return interview._once(("trial", n, count), lambda: self._made(count, n))
+
+    def _made(self, count: int, n: int) -> list[dict[str, Any]]:
+        options = self.interview._options
         weights = np.stack([self.interview._state(n).mean, options.features.chart.diagonal * 1.0])
         rng = options.rng(n, TRIAL)
         runs = options.loops(options.features.model(weights), options.starts(count, rng))
@@ -136,6 +155,13 @@ def _known(message: dict[str, Any]) -> int:
     if not is_whole(number):
         raise ValueError(f"number must be a whole number, got {number!r:.50}")
     return int(number)
+
+
+def _whole(message: dict[str, Any], name: str, least: int, most: int) -> int:
+    value: Any = message.get(name)
+    if not is_whole(value) or not least <= value <= most:
+        raise ValueError(f"{name} must be a whole number from {least} to {most}, got {value!r:.50}")
+    return int(value)
 
 
 def _one(runs: Trajectory, side: int, i: int) -> Trajectory:

@@ -38,6 +38,7 @@ class Files:
         title: str = "Ask a person",
         names: Sequence[str] | None = None,
         units: Sequence[str] | None = None,
+        draw: str | None = None,
         most: int = 30,
         overwrite: bool = False,
     ) -> None:
@@ -50,6 +51,9 @@ class Files:
         title : str
         names, units : sequence of str, optional
             Of the states, then the inputs, then (optional) the outputs, which are then shown.
+        draw : "masses", "pendulum" or "lane", optional
+            What moves: a drawing for the states of `oscillating_masses` (the default for that
+            plant), `cart_pendulum` or `kinematic_bicycle`. Other plants are shown by curves.
         most : int
             The page stops after so many answers, or when it knows enough.
 
@@ -61,7 +65,7 @@ class Files:
         FileExistsError
             If ``path`` exists and ``overwrite`` is False.
         """
-        shown: dict[str, Any] = {"title": title, "names": names, "units": units}
+        shown: dict[str, Any] = {"title": title, "names": names, "units": units, "draw": draw}
         shown |= {"most": positive_int("most", most), "overwrite": flag("overwrite", overwrite)}
         page.write(path, self._options, self._text(), **shown)
 

@@ -18,7 +18,7 @@ from prefmpc.asking.desk import Desk
 from prefmpc.asking.files import resume
 from prefmpc.asking.interview import Interview
 from prefmpc.asking.options import FUNCTIONS
-from prefmpc.asking.page import appearance, scripts, source
+from prefmpc.asking.page import DRAWINGS, appearance, scripts, source
 from prefmpc.systems.linear import LinearSystem
 
 CODE = """import jax
@@ -58,8 +58,10 @@ def ask(
     names, units : sequence of str, optional
         Of the states, then the inputs, then (optional) the outputs, which are then shown.
     draw : str, optional
-        A drawing, in JavaScript: a function without arguments that returns {element, move(x, u)},
-        an SVG element, and what moves it to a state and an input. It runs in the notebook.
+        A drawing for the states of a plant of the library, "masses", "pendulum" or "lane"; or one
+        of your own, in JavaScript: a function without arguments that returns {element, move(x, u,
+        share)}, an SVG element, and what moves it to a state, an input, and a share of the time.
+        It runs in the notebook.
     who : str, optional
         Who answers, for the log.
     level, certain : float
@@ -91,7 +93,8 @@ def ask(
     for name, value in (("draw", draw), ("who", who)):
         if value is not None and not (isinstance(value, str) and value.strip()):
             raise ValueError(f"{name} must be a text, got {value!r}")
-    shown = appearance(interview._options, names, units, None if draw is None else "own")
+    own = draw is not None and draw not in DRAWINGS
+    shown = appearance(interview._options, names, units, "own" if own else draw)
     torn = resume(interview, log, who is not None)
     notice = ""
     if interview._log is None:
@@ -105,7 +108,7 @@ def ask(
         )
         warnings.warn(notice, stacklevel=2)
     desk = Desk(interview, shown["states"] + shown["inputs"], *limits)
-    return _widget(desk, _config(interview, shown, limits[2]), notice, draw)
+    return _widget(desk, _config(interview, shown, limits[2]), notice, draw if own else None)
 
 
 def _notes(who: str | None) -> dict[str, Any]:

@@ -21,9 +21,12 @@ from prefmpc.systems.linear import LinearSystem, oscillating_masses
 SOURCES = Path(__file__).parent / "static" / "ask"
 SCRIPTS = (
     *("linalg", "random", "plant", "belief", "questions", "interview", "blind", "words", "draw"),
-    *("card", "player", "store", "view", "page"),
+    *("scenes", "card", "player", "store", "view", "page"),
 )
 """What every front end is made of, in this order."""
+
+DRAWINGS = {"masses": (6, 2), "pendulum": (4, 1), "lane": (4, 2)}
+"""The drawings that there are, with nx and nu of what they draw."""
 
 LINES = 3
 """So many curves can be told apart in one plot."""
@@ -92,13 +95,18 @@ def appearance(options: Options, names: Any, units: Any, draw: str | None = None
     names, units : sequence of str, optional
         Of the states, then the inputs, then (optional) the outputs.
     draw : str, optional
-        The name of a drawing.
+        One of `DRAWINGS`, or "own" for a drawing that comes with the widget.
     """
     system = options.system
     nx, nu = system.nx, system.nu
     masses = _are_the_masses(system)
     if masses and names is None and units is None:
         names, units = MASSES, MASSES_UNITS
+    if draw in DRAWINGS and DRAWINGS[draw] != (nx, nu):
+        raise ValueError(
+            "draw={!r} shows {} states and {} inputs, ".format(draw, *DRAWINGS[draw])
+            + f"the plant has {nx} and {nu}"
+        )
     default = [f"x{i + 1}" for i in range(nx)] + [f"u{i + 1}" for i in range(nu)]
     names = default if names is None else _texts("names", names, system)
     units = [""] * len(names) if units is None else _texts("units", units, system)
@@ -193,6 +201,7 @@ def write(
     title: Any,
     names: Any,
     units: Any,
+    draw: Any,
     most: int,
     overwrite: bool,
 ) -> None:
@@ -200,12 +209,14 @@ def write(
     _check_supported(options)
     if not isinstance(title, str) or not title.strip():
         raise ValueError(f"title must be a text, got {title!r}")
+    if draw is not None and not (isinstance(draw, str) and draw in DRAWINGS):
+        raise ValueError(f"draw must be one of {tuple(DRAWINGS)} or None, got {draw!r:.50}")
     system, prior = options.system, options.prior
     x0 = np.asarray(options.states.given)
     config = {
         "name": title,
         **{name: getattr(system, name).tolist() for name in ("A", "B", "C")},
-        **appearance(options, names, units),
+        **appearance(options, names, units, draw),
         "x0": x0.tolist(),
         "centre": {name: np.diag(getattr(prior, name)).tolist() for name in ("Q", "R")},
         "method": {"steps": options.steps, "most": most},

@@ -1,5 +1,8 @@
 """Logs of interviews: a line of JSON for the beginning, and one for each answer or undo.
 
+The answers of a blind test stand there too. Nothing is learned from them: they are checked and
+passed over.
+
 They come back from other computers and from people's hands: every line is checked when it is read.
 """
 
@@ -92,11 +95,27 @@ def answers_of(
             if "undo" in line:
                 _equal("undo", line["undo"], len(answers) - 1)
                 last = answers.pop()
+            elif "blind" in line:
+                _check_blind(line)
             else:
                 last = _answer(line, len(answers))
                 _alike(last, answers[0] if answers else last)
                 answers.append(last)
     return answers, last
+
+
+def _check_blind(line: dict[str, Any]) -> None:
+    """Check an answer to a pair of a blind test; null is one that was taken back."""
+    for name in ("blind", "number"):
+        value = _field(line, name)
+        if not is_whole(value) or value < 0:
+            raise ValueError(f"{name} must be a whole number, got {value!r:.50}")
+    if _field(line, "answer") is not None:
+        _number("answer", line["answer"], 0, 1)
+    if (learned := _field(line, "learned")) not in ("first", "second"):
+        raise ValueError(f'learned must be "first" or "second", got {learned!r:.50}')
+    for side in ("first", "second"):
+        _trajectory(line, side, "")
 
 
 def _answer(line: dict[str, Any], count: int) -> LoggedAnswer:
@@ -142,18 +161,18 @@ def _number(name: str, value: Any, least: float, most: float) -> float:
     return number(name, value, holds=lambda v: least <= v <= most and v < np.inf, wish=wish)
 
 
-def _trajectory(question: dict[str, Any], side: str) -> Trajectory:
-    stored = _field(question, side, "question.")
-    within = f"question.{side}."
+def _trajectory(question: dict[str, Any], side: str, path: str = "question.") -> Trajectory:
+    stored = _field(question, side, path)
+    within = f"{path}{side}."
     if not isinstance(stored, dict):
-        raise ValueError(f"question.{side} must be an object, got {stored!r:.50}")
+        raise ValueError(f"{path}{side} must be an object, got {stored!r:.50}")
     for name in ("x", "u", "y"):
         _field(stored, name, within)
     parts = {name: finite_array(within + name, stored[name]) for name in FIELDS if name in stored}
     try:
         trajectory = Trajectory(**parts)
     except ValueError as error:
-        raise ValueError(f"question.{side}: {error}") from None
+        raise ValueError(f"{path}{side}: {error}") from None
     if trajectory.batch_shape:
         raise ValueError(f"{within}x must have 2 dimensions, got {trajectory.x.shape}")
     return trajectory

@@ -64,6 +64,7 @@ class Browser:
         self._session = attached["sessionId"]
         for domain in ("Page", "Runtime", "Log", "Network"):
             self.call(f"{domain}.enable")
+        self.call("Performance.enable", timeDomain="threadTicks")
         self.call(
             "Network.emulateNetworkConditions",
             offline=True,
@@ -117,7 +118,7 @@ class Browser:
             message["sessionId"] = session
         os.write(self._to, json.dumps(message).encode() + b"\0")
         while True:
-            answer = self._read(30)
+            answer = self._read(120)  # axe-core takes its time on a long page
             if answer is None:
                 raise TimeoutError(f"no answer to {method}")
             if answer.get("id") == self._number:
@@ -190,6 +191,11 @@ class Browser:
             code["text"] = "\r"
         self.call("Input.dispatchKeyEvent", type="keyDown", **code)
         self.call("Input.dispatchKeyEvent", type="keyUp", **code)
+
+    def busy(self) -> float:
+        """Return how many ms the page has computed, scripts and drawing, in its main thread."""
+        metrics = self.call("Performance.getMetrics")["metrics"]
+        return 1000 * next(m["value"] for m in metrics if m["name"] == "TaskDuration")
 
     def resize(self, width: int, height: int) -> None:
         self.call(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +20,7 @@ from prefmpc import (
     QuadraticCost,
     bryson,
     cart_pendulum,
+    kinematic_bicycle,
     oscillating_masses,
     random_states,
 )
@@ -124,8 +126,10 @@ def a_session(seed: int) -> tuple[float, int, dict[str, Any]]:
     """Return the extra cost, how many pairs of the blind test were won, and the times in ms."""
     with Browser() as browser:
         visited(browser, f"crypto.getRandomValues = (words) => words.fill({seed});")
+        busy = [0.0, browser.busy()]
         for number in range(20):
             answer(browser, by_key=number % 2 == 0)
+            busy.append(browser.busy())
             if over(browser):
                 break
         if not over(browser):
@@ -136,6 +140,7 @@ def a_session(seed: int) -> tuple[float, int, dict[str, Any]]:
           const waits = visit.pressed.map((t) => visit.questions.find((q) => q > t) - t);
           return { first: visit.questions[0] - paint, waits: waits.filter((w) => w < 5000) };
         })()""")
+        times["busy"] = np.diff(busy)
         browser.click(".ask-test")
         browser.until(lambda: count(browser).startswith("Pair 1 "), "the blind test")
         for number in range(10):
@@ -145,6 +150,10 @@ def a_session(seed: int) -> tuple[float, int, dict[str, Any]]:
         browser.click(".ask-save")
         file = browser.downloads / "answers.jsonl"
         browser.until(lambda: written(file), "the download")
+        said = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+        blind = [line for line in said if "blind" in line]
+        assert len(blind) == 10
+        assert sum((line["learned"] == "first") == line["answer"] for line in blind) == wins
         assert told(browser) == []
         assert [r for r in browser.requests if not r.startswith(("file:", "data:", "blob:"))] == []
         assert browser("visit.shifts") < 0.02
@@ -152,24 +161,33 @@ def a_session(seed: int) -> tuple[float, int, dict[str, Any]]:
 
 
 def test_a_visitor_gets_a_good_controller() -> None:
-    """At most 20 answers, then the blind test; the times are also those of a busy machine."""
+    """At most 20 answers, then the blind test.
+
+    The clock also counts what else the machine does: it is shown, and the page's own time counts.
+    An answer's time includes the motion of what is seen until then.
+    """
     costs, wins, times = zip(*map(a_session, range(100, 100 + SESSIONS)), strict=True)
     waits = np.concatenate([t["waits"] for t in times])
     print(f"\nextra cost in %: {np.round(100 * np.array(costs), 2)}, wins of 10: {wins}")
     print(f"ms to a question: {np.round(np.quantile(waits, [0.5, 0.9, 1]))}")
     print(f"ms from first paint to first question: {[round(t['first']) for t in times]}")
+    first, later = [t["busy"][0] for t in times], np.concatenate([t["busy"][1:] for t in times])
+    print(f"own ms: {np.round(np.max(first))} to the first question, ", end="")
+    print(f"{np.round(np.quantile(later, [0.5, 0.9, 1]))} to each of the next ones")
     assert np.mean(np.array(costs) < 0.02) >= 0.9
     assert np.mean(wins) >= 8
-    assert np.median(waits) < 150
-    assert min(t["first"] for t in times) < 1000
+    assert max(first) < 1000
+    assert np.median(later) < 150
 
 
 def test_it_moves_smoothly(browser: Browser) -> None:
+    """By the clock on a machine that is at leisure; by its own time on any."""
     browser.click(".ask-again")
+    before = browser.busy()
     steps = np.diff(browser(FRAMES))
-    print(f"\n{(steps > 25).mean():.0%} of {len(steps)} frames dropped")
-    assert np.median(steps) < 20
-    assert (steps > 25).mean() < 0.2
+    own = (browser.busy() - before) / len(steps)
+    print(f"\n{(steps > 25).mean():.0%} of {len(steps)} frames dropped, {own:.1f} own ms a frame")
+    assert own < 8  # of the 16.7 that there are
 
 
 def test_keys_alone(browser: Browser) -> None:
@@ -265,7 +283,15 @@ def of_the_pendulum() -> tuple[Interview, dict[str, Any]]:
     plant = cart_pendulum().linearise(np.zeros(4), np.zeros(1))
     prior = bryson([1, 0.3, 1, 1], [10])
     interview = Interview(plant, prior, x0=[0.5, 0.1, 0.1, 0.1], steps=60, key=0)
-    return interview, {"names": PENDULUM, "units": PENDULUM_UNITS, "title": "The pendulum"}
+    shown = {"names": PENDULUM, "units": PENDULUM_UNITS, "title": "The pendulum"}
+    return interview, {**shown, "draw": "pendulum"}
+
+
+def of_the_car() -> tuple[Interview, dict[str, Any]]:
+    plant = kinematic_bicycle().linearise(np.array([0, 0, 0, 20.0]), np.zeros(2))
+    prior = bryson([1, 0.1, 0.1, 1], [0.4, 2])
+    interview = Interview(plant, prior, x0=[[3.5, 0, 0, 0], [3.5, 0.02, 0, 1]], steps=25, key=0)
+    return interview, {"title": "A lane change", "draw": "lane"}
 
 
 def of_my_own() -> tuple[Interview, dict[str, Any]]:
@@ -274,8 +300,13 @@ def of_my_own() -> tuple[Interview, dict[str, Any]]:
     return interview, {"names": EVIL, "units": EVIL, "title": f"{EVIL[0]} </title> 😀"}
 
 
+def where(page: Browser) -> Any:
+    """Return where all that a drawing moves is."""
+    return page("[...document.querySelectorAll('.ask-scene g')].map((g) => g.outerHTML).join()")
+
+
 @pytest.mark.parametrize("width", [390, 1280])
-@pytest.mark.parametrize("make", [of_the_pendulum, of_my_own])
+@pytest.mark.parametrize("make", [of_the_pendulum, of_the_car, of_my_own])
 def test_a_file_of_its_own(tmp_path: Path, make: Any, width: int) -> None:
     jax.config.update("jax_enable_x64", True)
     interview, shown = make()
@@ -289,7 +320,12 @@ def test_a_file_of_its_own(tmp_path: Path, make: Any, width: int) -> None:
         assert page("document.querySelectorAll('main > p b').length") == 1
         assert page("document.documentElement.dataset.theme") == "dark"
         assert page("document.documentElement.scrollWidth") <= width
-        assert shown["names"][1] in page("document.querySelector('.ask').textContent")
+        name = shown["names"][1] if "names" in shown else "x2"
+        assert name in page("document.querySelector('.ask').textContent")
+        if "draw" in shown:
+            before = where(page)
+            page.until(lambda: where(page) != before, "something moves")
+            assert "NaN" not in where(page)
         for number in range(6):
             before = count(page)
             page.press(("ArrowLeft", "ArrowRight", "ArrowDown")[number % 3])
@@ -314,5 +350,6 @@ def test_a_file_of_its_own(tmp_path: Path, make: Any, width: int) -> None:
         page.until(lambda: count(page).startswith("Pair 1 "), "the blind test")
         # Nothing but the file itself was read, and its policy let nothing else run.
         assert {r for r in page.requests if not r.startswith("blob:")} == {path.as_uri()}
+        assert page("document.querySelectorAll('.ask-scene').length") == 2 * ("draw" in shown)
         page("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=\"spoiled = 1\">')")
         assert page("typeof spoiled") == "undefined"

@@ -19,6 +19,11 @@
     return { wins, count, ties: answers.length - count, low, high };
   }
 
+  // The lines of the log for the answers to a blind test that was made after `number` answers.
+  const lines = (pairs, answers, number) => answers.map((answer, pair) => JSON.stringify({
+    blind: pair, number, answer: { first: 1, second: 0 }[answer] ?? answer, ...pairs[pair],
+  }) + "\n").join("");
+
   // Somebody who always takes the response with the smaller Σ w φ; w: weights of x, then of u.
   function visitor(w) {
     return async ({ first, second }) => {
@@ -28,5 +33,5 @@
     };
   }
 
-  ask.blind = { verdict, visitor, wilson };
+  ask.blind = { lines, verdict, visitor, wilson };
 })(globalThis.prefmpcAsk = globalThis.prefmpcAsk || {});

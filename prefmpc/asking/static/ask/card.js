@@ -73,7 +73,7 @@
       if (!shown) return;
       const { x, u } = shown, place = share * u.length;
       for (const c of charts) c.move(share);
-      if (scene) scene.move(between(x, place), u[Math.min(Math.floor(place), u.length - 1)]);
+      if (scene) scene.move(between(x, place), u[Math.min(Math.floor(place), u.length - 1)], share);
     }
 
     function flash() {

@@ -95,7 +95,7 @@
   const COIL = "M0 0H.1" + [...Array(8)].map((_, i) =>
     `L${(0.1 + 0.1 * (i + 0.5)).toFixed(2)} ${i % 2 ? 7 : -7}`).join("") + "L.9 0H1";
 
-  // A drawing is {element, move(x, u)}: x and u between the samples.
+  // A drawing is {element, move(x, u, share)}: x and u between the samples, share of the time.
   function masses() {
     const springs = [0, 1, 2, 3].map(() =>
       svg("path", { class: "ask-spring", d: COIL, "vector-effect": "non-scaling-stroke" }));
@@ -123,12 +123,12 @@
   }
 
   // An arrow above a mass, as long as the force is large.
-  function pointer(from, force) {
-    const to = from + 52 * force, y = 20, sign = Math.sign(force);
+  function pointer(from, force, y = 20) {
+    const to = from + 52 * force, sign = Math.sign(force);
     const head = Math.min(8, Math.abs(to - from));
     if (head < 3) return "";
     return `M${from.toFixed(1)} ${y}H${to.toFixed(1)}m${-sign * head} -5l${sign * head} 5l${-sign * head} 5`;
   }
 
-  ask.draw = { between, chart, scenes: { masses }, svg };
+  ask.draw = { between, chart, pointer, scenes: { masses }, svg };
 })(globalThis.prefmpcAsk = globalThis.prefmpcAsk || {});

@@ -32,19 +32,21 @@
     const clock = ask.player.player(duration, (share) => v.cards.forEach((card) => card.move(share)), playing);
     let session, own = null, busy = true, timer = 0, shown = null, notice = given.notice || "";
 
-    // A session: {interviewer, person (of a simulated visitor), phase, pairs, answers, more, state}.
+    // A session: {interviewer, person (of a simulated visitor), phase, pairs, answers, number, tests,
+    // more, state}; number: of answers when the blind test was made, tests: the log of those before.
     async function open(kept, person = null) {
       session = {
         interviewer: await begin(kept?.log), person, phase: kept?.phase || "asking",
-        pairs: kept?.pairs || [], answers: kept?.answers || [], more: kept?.more || false,
+        pairs: kept?.pairs || [], answers: kept?.answers || [], number: kept?.number || 0,
+        tests: kept?.tests || "", more: kept?.more || false,
       };
       session.state = await session.interviewer.progress();
     }
 
     async function keep() {
       if (session.person || given.storage === null) return;
-      const { phase, pairs, answers, more } = session;
-      place.write({ log: await session.interviewer.log(), phase, pairs, answers, more });
+      const { phase, pairs, answers, number, tests, more } = session;
+      place.write({ log: await session.interviewer.log(), phase, pairs, answers, number, tests, more });
     }
 
     // ---- what is shown ----
@@ -168,6 +170,7 @@
       v.cards.forEach((card, i) => { if (value === ["first", "second"][i]) card.flash(); });
       act(async () => {
         if (session.phase === "trial") {
+          await judged(value);
           session.answers.push(value);
           if (session.answers.length === session.pairs.length) session.phase = "done";
           return;
@@ -181,7 +184,11 @@
     async function undo() {
       if (session.phase === "trial" || session.phase === "done") {
         if (!session.answers.length) return;
-        session.answers.pop();
+        const last = session.answers.pop();
+        await judged(null).catch((error) => {
+          session.answers.push(last);
+          throw error;
+        });
         session.phase = "trial";
       } else if (session.state.count) {
         session.state = await session.interviewer.undo();
@@ -189,13 +196,21 @@
       }
     }
 
+    // An interviewer that writes elsewhere learns at once what is said of a pair of the blind test.
+    async function judged(value) {
+      const { interviewer, answers, number } = session;
+      await interviewer.judge?.({ count: PAIRS, pair: answers.length, number, value });
+    }
+
+    const tested = () => session.tests + ask.blind.lines(session.pairs, session.answers, session.number);
+
     async function stop() {
       session.phase = "rest";
     }
 
     async function test() {
-      session.pairs = await session.interviewer.trial(PAIRS);
-      session.answers = [];
+      const pairs = await session.interviewer.trial(PAIRS), tests = tested();
+      Object.assign(session, { pairs, answers: [], number: session.state.count, tests });
       session.phase = "trial";
       focus();
     }
@@ -235,7 +250,7 @@
     }
 
     async function save() {
-      ask.store.download("answers.jsonl", await session.interviewer.log());
+      ask.store.download("answers.jsonl", await session.interviewer.log() + tested());
     }
 
     async function copy() {

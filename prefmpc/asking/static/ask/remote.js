@@ -48,6 +48,7 @@
       undo: () => known("undo", { number: count }),
       progress: () => known("progress"),
       trial: (pairs) => send("trial", { count: pairs }),
+      judge: (given) => send("judge", given),
       log: () => send("log"),
       close: () => model.off("msg:custom", receive),
     };
