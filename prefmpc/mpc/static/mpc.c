@@ -200,7 +200,8 @@ mpc_status mpc_step(const mpc_float *x, mpc_float *u)
     iterations = (int)mpc_osqp_solver.info->iter;
     said = (int)mpc_osqp_solver.info->status_val;
     if (said == OSQP_PRIMAL_INFEASIBLE || said == OSQP_PRIMAL_INFEASIBLE_INACCURATE) {
-        residual = doubt(found->prim_inf_cert);
+        /* Embedded, OSQP leaves its proof here. */
+        residual = doubt(mpc_osqp_solver.work->delta_y->values);
         return ended(residual <= DATA_PROVEN ? MPC_INFEASIBLE : MPC_FAILED);
     }
     if (said != OSQP_SOLVED && said != OSQP_SOLVED_INACCURATE && said != OSQP_MAX_ITER_REACHED) {
