@@ -220,7 +220,7 @@ def test_without_an_answer_the_input_stays_and_the_status_says_so(precision, tmp
     assert said == [int(line[1]) for line in lines]
     # That there is no plan may take more iterations to prove than there are; no input either way.
     assert said[:2] + said[3:] == [0, 4, 1, 0, 1, 0]
-    assert said[2] == 1 or precision == "float" and said[2] == 2
+    assert said[2] == 1 or (precision == "float" and said[2] == 2)
     assert references == ["4", "4"]
     for state, line in zip(asked, lines, strict=True):
         if line[0] == "0":

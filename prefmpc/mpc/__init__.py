@@ -3,6 +3,7 @@
 from prefmpc.mpc.batched import BatchedMPC
 from prefmpc.mpc.convex import ConvexMPC
 from prefmpc.mpc.export import CExport, export_c
+from prefmpc.mpc.feedback import KalmanEstimator, OutputFeedback
 from prefmpc.mpc.loops import ClosedLoops, closed_loops, mpc_rollout
 from prefmpc.mpc.nonlinear import NonlinearMPC
 from prefmpc.mpc.qp import LinearMPC
@@ -17,10 +18,12 @@ __all__ = [
     "CExport",
     "ClosedLoops",
     "ConvexMPC",
+    "KalmanEstimator",
     "LinearMPC",
     "MPCError",
     "MPCSolution",
     "NonlinearMPC",
+    "OutputFeedback",
     "ReferenceTracker",
     "StabilityCheck",
     "SteadyState",
