@@ -22,7 +22,11 @@ MASSES = oscillating_masses()
 COST = QuadraticCost(np.diag([10.0, 10, 10, 1, 1, 1]), 0.1 * np.eye(2))
 NOISE = {"state_noise": [1e-2] * 6, "output_noise": [1e-3] * 3}
 FORCES = {**NOISE, "disturbance_noise": [0.3] * 2}
-ANY = {**NOISE, "B_d": np.zeros((6, 3)), "C_d": np.eye(3), "disturbance_noise": [0.1] * 3}
+ON_ALL = LinearSystem.from_continuous(
+    np.block([[np.zeros((3, 3)), np.eye(3)], [np.zeros((3, 6))]]), np.eye(6, 3, -3), dt=0.2
+).B
+ANY = {**NOISE, "B_d": ON_ALL, "disturbance_noise": [0.1] * 3}
+"""Accelerations of all three masses: as many disturbances as outputs."""
 
 
 def run(plant, feedback, steps, force=(0.0, 0.0), noise=0.0):
@@ -41,18 +45,18 @@ def feedback(model=MASSES, y_r=None, noise=FORCES, **options):
     return OutputFeedback(controller, KalmanEstimator(model, **noise), y_r)
 
 
-@pytest.mark.parametrize("noise", [FORCES, ANY], ids=["known to be forces", "unknown"])
+@pytest.mark.parametrize("noise", [FORCES, ANY], ids=["at the inputs", "anywhere"])
 def test_a_constant_force_leaves_no_offset(noise):
     loop = feedback(noise=noise)
-    y = run(MASSES, loop, 150, force=(0.5, 0.0))
+    y = run(MASSES, loop, 120, force=(0.5, 0.0))
     assert np.abs(y).max() > 0.01
     assert np.abs(y[-1]).max() < 1e-6
     if noise is FORCES:
         np.testing.assert_allclose(loop.estimate.d, [0.5, 0], atol=1e-6)
     plain = LinearMPC(MASSES, COST, 15)
     x = np.zeros(6)
-    for _ in range(150):
-        x = MASSES.step(x, plain(x) + [0.5, 0])
+    for _ in range(60):
+        x = MASSES.step(x, plain(x) + np.array([0.5, 0]))
     assert np.abs(x[:3]).max() > 1e-3  # with the state itself, but not told of the force
 
 
@@ -60,19 +64,19 @@ def test_a_constant_force_leaves_no_offset(noise):
 def test_a_wrong_model_leaves_no_offset(factor):
     model = oscillating_masses(np.array([1, 0.5, 1]) * factor, [2.2, 1.8, 2, 2.1])
     held = steady_state(MASSES, [0.15, 0.1, 0.05], nearest=True)
-    y = run(MASSES, feedback(model, held.y, ANY), 300)
+    y = run(MASSES, feedback(model, held.y, ANY), 160)
     assert np.abs(y[-1] - held.y).max() < 1e-6
-    informed = steady_state(model, held.y, nearest=True)
-    assert np.abs(MASSES.C @ np.linalg.solve(np.eye(6) - MASSES.A, MASSES.B @ informed.u) -
-                  held.y).max() > 1e-3  # what the model alone would hold
+    # What the model alone would hold is somewhere else.
+    u = steady_state(model, held.y, nearest=True).u
+    rest = MASSES.C @ np.linalg.solve(np.eye(6) - MASSES.A, MASSES.B @ u)
+    assert np.abs(rest - held.y).max() > 1e-3
 
 
 def test_with_noise_and_soft_limits_it_goes_on():
     room = Polyhedron.box([-0.2] * 3 + [-9] * 3 + [-1] * 2, [0.2] * 3 + [9] * 3 + [1] * 2)
     loop = feedback(y_r=[0.19, 0.15, 0.1], constraints=room, soft=200.0)
-    y = run(MASSES, loop, 100, force=(0.2, 0.1), noise=0.01)
-    assert np.isfinite(y).all()
-    assert np.abs(y[50:].mean(axis=0) - loop.target().y).max() < 0.02
+    y = run(MASSES, loop, 60, force=(0.2, 0.1), noise=0.01)
+    assert np.abs(y[30:].mean(axis=0) - loop.target().y).max() < 0.05
 
 
 def test_the_gain_is_that_of_python_control():
@@ -83,9 +87,7 @@ def test_the_gain_is_that_of_python_control():
     L, _, _ = control.dlqe(A, np.eye(8), C, W, 1e-6 * np.eye(3))
     y = np.array([0.3, -0.2, 0.1])
     found = own.corrected(y)
-    wanted = np.linalg.solve(A, L @ y)  # python-control's gain is that of a prediction
-    if not np.allclose(wanted[:6], found.x, atol=1e-8):
-        wanted = L @ y
+    wanted = np.linalg.solve(A, L @ y)  # that gain is for a prediction
     np.testing.assert_allclose(np.concatenate([found.x, found.d]), wanted, atol=1e-8)
 
 

@@ -1,4 +1,4 @@
-"""Control from measured outputs, without an offset: a Kalman filter that also finds disturbances."""
+"""Control from measured outputs without an offset: a Kalman filter that finds disturbances."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ class KalmanEstimator:
     B_d : array (nx, nd), optional
         Default: B, disturbances that enter like the inputs.
     C_d : array (ny, nd), optional
-        Default: zeros. For a model that is wrong nobody knows how: as many disturbances as
-        outputs, for instance B_d = 0 and C_d = I.
+        Default: zeros. For a model that is wrong in ways unknown take as many disturbances as
+        outputs, where errors come in: forces, rather than offsets of the outputs (C_d), which a
+        plant with little damping hardly tells from its own swinging.
     state_noise : array (nx,)
     output_noise : array (ny,)
     disturbance_noise : array (nd,)
