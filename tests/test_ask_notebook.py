@@ -50,7 +50,7 @@ def test_a_front_end_gets_the_same_interview_as_python(tmp_path: Path) -> None:
         assert state["count"] == number + 1
     undisturbed.answer_with(PERSON, 10)
     assert same(interview.next(), undisturbed.next())
-    assert state["bound"] == undisturbed.regret.quantile(0.9)
+    assert state["bound"] == undisturbed.regret.bound(0.9)
     assert state["enough"] == (state["bound"] <= 0.02)
     assert state["consistency"] == {"repeats": 1, "equal": 1}
     model: Any = interview.model

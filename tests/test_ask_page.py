@@ -53,14 +53,6 @@ def page() -> Iterator[Page]:
     page.close()
 
 
-@pytest.fixture(scope="module", autouse=True)
-def _to_the_last_digit() -> Iterator[None]:
-    """Let the library go on, as the page does, when its certificate is good enough."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(belief, "TOLERANCE", 1e-18)
-        yield
-
-
 def options(**given: Any) -> Options:
     defaults = {
         name: parameter.default
@@ -114,7 +106,7 @@ def sessions(page: Page) -> list[tuple[Session, Any, Any]]:
 def test_weights_and_their_deviations(sessions: list[tuple[Session, Any, Any]]) -> None:
     for _, laplace, found in sessions:
         assert found["success"]
-        assert laplace.success or laplace.decrement < 1e-12
+        assert laplace.success
         np.testing.assert_allclose(found["eta"], laplace.eta, **CLOSE)
         np.testing.assert_allclose(found["lapse"], laplace.lapse, **CLOSE)
         np.testing.assert_allclose(found["curvature"], laplace.curvature, **CLOSE)
@@ -123,9 +115,7 @@ def test_weights_and_their_deviations(sessions: list[tuple[Session, Any, Any]]) 
         odds = [np.array(weights)[counts] for weights in (found["weights"], laplace.weights)]
         np.testing.assert_allclose(*(weights / weights.max() for weights in odds), **CLOSE)
         np.testing.assert_allclose(np.array(found["at"])[counts], laplace.at[counts], **CLOSE)
-        ours, theirs = np.array(found["roots"])[counts], laplace.roots[counts]
-        covariance = ours @ ours.swapaxes(1, 2), theirs @ theirs.swapaxes(1, 2)
-        np.testing.assert_allclose(*covariance, **CLOSE)
+        np.testing.assert_allclose(np.array(found["roots"])[counts], laplace.roots[counts], **CLOSE)
 
 
 def test_gains_and_closed_loops(page: Page, sessions: list[tuple[Session, Any, Any]]) -> None:
@@ -172,7 +162,8 @@ def test_information_and_regret(page: Page, sessions: list[tuple[Session, Any, A
       const plant = ask.masses(), q = ask.questions;
       const found = q.candidates(plant, centre, w.slice(0, 4), x0, 20), all = q.pairs(found);
       return [all, q.gains(found, all, {w, lapse}),
-              q.regret(plant, {centre, steps: 20}, mean, w, x0)];
+              q.regret(plant, {centre, steps: 20}, mean, w, x0)].map((found, i, all) =>
+        i < 2 ? found : [found, q.bound(found, 0.9)]);
     }"""
     for session, laplace, _ in sessions[::5]:
         rng, setup = session.rng, session.options
@@ -183,10 +174,12 @@ def test_information_and_regret(page: Page, sessions: list[tuple[Session, Any, A
         cost = w @ setup.features(shown.trajectories).T
         P = questions.probability(cost[:, shown.pairs[1]] - cost[:, shown.pairs[0]], lapse)
         given = {"centre": CENTRE, "w": w, "lapse": lapse, "x0": x0, "mean": mean}
-        all_pairs, gain, values = page(code, **given)
+        all_pairs, gain, (values, bound) = page(code, **given)
         assert np.array_equal(np.transpose(all_pairs), shown.pairs)
         np.testing.assert_allclose(gain, questions.information(P), **CLOSE)
-        np.testing.assert_allclose(values, regret.regret_of(mean, w, setup).values, **CLOSE)
+        ours = regret.regret_of(mean, w, setup)
+        np.testing.assert_allclose(values, ours.values, **CLOSE)
+        np.testing.assert_allclose(bound, ours.bound(), **CLOSE)
 
 
 def test_it_is_the_same_plant_with_the_same_numbers(page: Page) -> None:
@@ -205,7 +198,6 @@ def test_it_is_the_same_plant_with_the_same_numbers(page: Page) -> None:
     assert (ours["level"], ours["certain"]) == (level["level"].default, level["q"].default)
     assert ours["slices"] == belief.SLICES
     assert (ours["controllers"], ours["states"]) == (loops.CONTROLLERS, loops.STATES)
-    assert ours["judged"] == regret.JUDGED
     assert f"RECENT = {RECENT};" in (SCRIPTS / "questions.js").read_text(encoding="utf-8")
 
 

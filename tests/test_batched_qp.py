@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from random_programs import answers, by_clarabel, random_programs
 
+from prefmpc import BatchedMPC, LinearSystem, Polyhedron, QuadraticCost
 from prefmpc.mpc import _batched_qp, _dual_method
 from prefmpc.mpc._batched_qp import FAILED, INFEASIBLE, SOLVED, STATUSES, UNFINISHED, solve
 from prefmpc.mpc._condensed import inverse_root, scaled
@@ -185,3 +186,19 @@ def test_the_derivative_of_an_inverse_root():
     np.testing.assert_allclose(root @ H @ root.T, np.eye(4), atol=1e-12)
     step = (inverse_root(H + 1e-6 * dH) - inverse_root(H - 1e-6 * dH)) / 2e-6
     np.testing.assert_allclose(jax.jvp(inverse_root, (H,), (dH,))[1], step, atol=1e-7)
+
+
+def test_a_state_held_at_its_limit_takes_no_input_at_all():
+    # A cart at its largest speed far away: the plan is u = 0, which no error is small beside.
+    system = LinearSystem([[1, 0.1], [0, 1]], [[0.005], [0.1]], dt=0.1, u_min=-1, u_max=1)
+    sets = Polyhedron.box([-2, -0.4, -1], [2, 0.4, 1])
+    cost = QuadraticCost(np.diag([4.0, 0.2]), [[0.5]])
+    for unit in (1e-6, 1.0, 1e6):  # a micrometre, a metre, a thousand kilometres
+        T = unit * np.eye(2)
+        plant = LinearSystem(system.A, T @ system.B, dt=0.1, u_min=-1, u_max=1)
+        scaled = QuadraticCost(cost.Q / unit**2, cost.R)
+        box = Polyhedron(sets.H @ np.diag([1 / unit, 1 / unit, 1]), sets.h)
+        x0 = unit * np.array([[1.08, -0.4], [1.9, -0.4], [-1.5, 0.4]])
+        plan = BatchedMPC(plant, scaled, horizon=10, constraints=box).solve(x0)
+        assert (plan.status == "solved").all()
+        assert np.abs(plan.u).max() < 1e-9

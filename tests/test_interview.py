@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import control
 import jax
 import numpy as np
 import pytest
@@ -111,12 +112,17 @@ def test_a_lapse_rate_is_estimated():
         coin = rng.uniform(size=2)
         return PERSON(first, second) if coin[0] > 0.3 else np.array([float(coin[1] < 0.5)])
 
-    careless, careful = cart(lapse="estimate"), cart(lapse="estimate")
-    careless.answer_with(lapsing, 40)
-    careful.answer_with(PERSON, 40)
-    assert careful.certificate.lapse < 0.03 < 0.06 < careless.certificate.lapse
-    assert careful.certificate.success
-    assert careless.certificate.success
+    rates = []
+    for key in range(3):
+        interviews = [cart(lapse="estimate", key=key) for _ in range(2)]
+        for interview, person in zip(interviews, (lapsing, PERSON), strict=True):
+            interview.answer_with(person, 40)
+            assert interview.certificate.success
+        rates.append([interview.certificate.lapse for interview in interviews])
+    careless, careful = np.array(rates).T
+    assert (careful < 0.03).all()
+    assert (careless > careful).all()
+    assert careless.mean() > 1.5 * careful.mean()
     assert cart(lapse=0.1).certificate.lapse == 0.1
 
 
@@ -179,6 +185,33 @@ def test_one_in_eight_is_asked_again_with_sides_swapped():
     assert 0.2 < seen.first < 0.8
 
 
+def test_regret_is_that_of_the_loops_of_who_knows_the_weights():
+    interview = cart(repeat_every=0)
+    interview.answer_with(PERSON, 5)
+    options, found = interview._options, interview.regret
+    x0 = options.states.draw(12, options.rng(0, 2))
+    samples = [interview.posterior[np.array(i)] for i in range(150)]
+    loops = []
+    for model in (interview.model, *samples):
+        K = control.dlqr(CART.A, CART.B, model.Q, model.R)[0]
+        loops.append(prefmpc.rollout(CART, x0, K, options.steps, saturate=True))
+    ours, best = (
+        np.array([prefmpc.phi(T, m.Q, m.R).mean() for T, m in zip(runs, samples, strict=True)])
+        for runs in ([loops[0]] * 150, loops[1:])
+    )
+    np.testing.assert_allclose(found.values, np.maximum(ours / best - 1, 0), rtol=1e-6, atol=1e-9)
+
+
+def test_a_bound_leaves_room_for_the_error_of_the_samples():
+    regret = prefmpc.asking.regret.Regret(np.arange(101) / 1000)
+    assert regret.quantile(0.9) == pytest.approx(0.09)
+    assert regret.bound(0.9) == pytest.approx(0.09 + 1.645 * np.sqrt(0.09 / 101) / 10)
+    assert regret.bound(0.999) == pytest.approx(0.1)
+    assert regret.stop(0.095)
+    assert not regret.stop(0.0945)
+    assert str(regret) == "5 % (median), at most 9.5 % with probability 0.9"
+
+
 def test_a_habit_of_answering_first_shows():
     interview = cart()
     for _ in range(16):
@@ -233,6 +266,46 @@ def test_mpc_keeps_the_constraints_of_what_is_shown():
         for side in (question.first, question.second):
             assert np.abs(side.x[..., 1]).max() <= 0.4 + 1e-6
     assert interview.regret.quantile() > 0
+
+
+@pytest.mark.parametrize("controller", ["lqr", "mpc"])
+def test_loops_reach_set_points_within_the_limits(controller):
+    goals = [prefmpc.steady_state(CART, [0.6, 0.0]), prefmpc.steady_state(CART, [-1.0, 0.0])]
+    limits = Polyhedron.box([-2, -0.4, -1], [2, 0.4, 1]) if controller == "mpc" else None
+    options = {"reference": goals, "controller": controller, "constraints": limits}
+    interview = cart(x0=[[0.2, 0.0]], steps=25, **options)
+    interview.answer_with(PERSON, 4)
+    for question in interview.questions:
+        for side in (question.first, question.second):
+            np.testing.assert_allclose(side.x[0], [0.2, 0.0])
+            np.testing.assert_allclose(side.x[1:], CART.step(side.x[:-1], side.u), atol=1e-12)
+            assert np.abs(side.u).max() <= 1 + 1e-9
+            if limits:
+                assert np.abs(side.x[:, 1]).max() <= 0.4 + 1e-6
+        assert np.array_equal(question.first.x_r, question.second.x_r)
+        assert question.first.x_r[0] in (0.6, -1.0)
+    cost = prefmpc.QuadraticCost(np.diag([4.0, 0.2]), [[0.5]])
+    starts = np.tile([0.2, 0.0], (3, 1))
+    runs = interview._options.loops(jax.tree.map(lambda leaf: leaf[None], cost), starts)
+    np.testing.assert_array_equal(runs.x_r[0], [goals[i].x for i in (0, 1, 0)])
+    assert np.abs(runs.x[0, :, -1] - runs.x_r[0]).max() < 0.5
+    if controller == "lqr":
+        K = control.dlqr(CART.A, CART.B, cost.Q, cost.R)[0]
+        wanted = np.clip((runs.x_r[0, :, None] - runs.x[0, :, :-1]) @ K.T, -1, 1)
+        np.testing.assert_allclose(runs.u[0], wanted, atol=1e-9)
+    assert interview.regret.quantile() >= 0
+
+
+def test_a_set_point_goes_with_what_makes_loops_to_it():
+    goal = prefmpc.steady_state(CART, [0.6, 0.0])
+    with pytest.raises(ValueError, match="reference must be a steady state"):
+        cart(reference=prefmpc.SteadyState(goal.x, goal.u + 0.1, goal.y))
+    with pytest.raises(ValueError, match="reference must be a sequence of at least one"):
+        cart(reference=[])
+    with pytest.raises(ValueError, match="reference must be None with a pool"):
+        cart(reference=goal, controller=lambda models, x0: None)
+    with pytest.raises(ValueError, match="prior must be given"):
+        Interview(CART, x0=[1.0, 0.5], key=0, reference=goal)
 
 
 def test_the_result_is_fit_map_of_the_same_answers():

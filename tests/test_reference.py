@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import re
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 import pytest
@@ -49,3 +50,12 @@ def test_every_example_holds_on_its_own(name):
 
             exec(compile(example, f"{name}:\n{example}", "exec"), {**ready, "print": record})
             assert printed == PRINTED.findall(example), example
+
+
+def test_the_readme_s_examples_run_one_after_the_other():
+    page = (FOLDER.parents[2] / "README.md").read_text("utf-8")
+    names: dict[str, Any] = {}
+    for example in EXAMPLE.findall(page):
+        exec(compile(example, f"README.md:\n{example}", "exec"), names)
+    assert names["interview"].finished() is not None
+    assert names["sigma"].Q[0, 0] > 0

@@ -88,7 +88,7 @@ def stopping_case(
     dict
         "asked" (people,): after how many answers the regret was stated to be below 2 % with
         probability 0.9 for the first time, inf if not within ``cap``; "stated" (people, 5): the
-        90 % quantile that was stated after each of `STOPPING_COUNTS` and when stopped (NaN if
+        bound of 90 % that was stated after each of `STOPPING_COUNTS` and when stopped (NaN if
         not); "regret" (people, 5, `MEASURES`): what it was in truth; "accuracy" (people, `TESTS`).
     """
     seed = int(generator(key).integers(2**63))
@@ -107,10 +107,10 @@ def stopping_case(
             answer_until(interview, person.answers, n, rng)
             if not np.isfinite(asked[i]) and interview.regret.stop():
                 asked[i] = n
-                stated[i, -1], models[-1] = interview.regret.quantile(), interview.model
+                stated[i, -1], models[-1] = interview.regret.bound(), interview.model
             if n in STOPPING_COUNTS:
                 place = STOPPING_COUNTS.index(n)
-                stated[i, place], models[place] = interview.regret.quantile(), interview.model
+                stated[i, place], models[place] = interview.regret.bound(), interview.model
             if n >= max(STOPPING_COUNTS) and np.isfinite(asked[i]):
                 break
         regret[i] = true_regret(person, models, x0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import jax
 import numpy as np
 
 from prefmpc._checks import is_whole
@@ -94,7 +95,8 @@ class Desk:
 
     def _progress(self) -> dict[str, Any]:
         interview, consistency = self.interview, self.interview.consistency
-        bound, median = (interview.regret.quantile(q) for q in (self._limits["certain"], 0.5))
+        regret = interview.regret
+        bound, median = regret.bound(self._limits["certain"]), regret.quantile(0.5)
         repeats = consistency.repeats
         return {
             "count": len(interview),
@@ -117,7 +119,7 @@ class Desk:
         options, n = self.interview._options, len(self.interview)
         weights = np.stack([self.interview._state(n).mean, options.features.chart.diagonal * 1.0])
         rng = options.rng(n, TRIAL)
-        runs = options.loops(options.features.model(weights), options.states.draw(count, rng))
+        runs = options.loops(options.features.model(weights), options.starts(count, rng))
         pairs = []
         for i in np.flatnonzero(~failed(runs).any(axis=0)):
             learned = "first" if rng.uniform() < 0.5 else "second"
@@ -137,7 +139,7 @@ def _known(message: dict[str, Any]) -> int:
 
 
 def _one(runs: Trajectory, side: int, i: int) -> Trajectory:
-    return Trajectory(*(np.asarray(getattr(runs, name))[side, i] for name in ("x", "u", "y")))
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[side, i], runs)
 
 
 def _shares(interview: Interview, names: list[dict[str, str]]) -> list[dict[str, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -26,6 +26,7 @@ from prefmpc.learning.convex import MapResult, fit_map
 from prefmpc.learning.priors import WishartPrior
 from prefmpc.models.quadratic import CostModel
 from prefmpc.models.separable import SeparableCost
+from prefmpc.mpc.steady import SteadyState
 from prefmpc.preferences.comparisons import Comparisons
 from prefmpc.preferences.people import Preference, asked
 from prefmpc.systems.linear import System
@@ -61,6 +62,9 @@ class Interview(Files):
     controller : "lqr", "mpc", or function
         Who makes the loops: saturated LQR, MPC with the constraints, or a function (stack of c σ,
         x0 (m, nx)) ↦ trajectories (c, m).
+    reference : SteadyState or list of SteadyState, optional
+        What the loops are to reach (see `steady_state`), and σ is about deviations from it; of
+        several each question is about one.
     horizon : int
         N of the MPC.
     constraints : Polyhedron, optional
@@ -99,6 +103,7 @@ class Interview(Files):
         coupling: float = 0.5,
         steps: int = 20,
         controller: Controller = "lqr",
+        reference: SteadyState | Sequence[SteadyState] | None = None,
         horizon: int = 10,
         constraints: Polyhedron | None = None,
         pool: Pool | None = None,

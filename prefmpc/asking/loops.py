@@ -11,6 +11,7 @@ import numpy as np
 from prefmpc._pytree import bypass_init
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.mpc.loops import closed_loops
+from prefmpc.mpc.steady import SteadyState
 from prefmpc.preferences.trajectories import Trajectory, failed
 from prefmpc.systems.linear import RICCATI, LinearSystem
 from prefmpc.systems.sets import Polyhedron
@@ -103,6 +104,41 @@ def loops_of(
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:count], *parts)
 
     return mpc
+
+
+def loops_about(
+    references: list[SteadyState], system: LinearSystem, constraints: Polyhedron | None, make: Any
+) -> Loops:
+    """Return loops to set points: the k-th of m x(0) belongs to the k-th of r set points, k mod r.
+
+    Parameters
+    ----------
+    make : function
+        (system, constraints) ↦ loops to the origin; it is given what is left of both about each
+        set point.
+    """
+    r, own = len(references), []
+    for at in references:
+        limits = {"u_min": system.u_min - at.u, "u_max": system.u_max - at.u}
+        moved = LinearSystem(system.A, system.B, system.C, dt=system.dt, **limits)
+        sets = constraints
+        if sets is not None:
+            sets = Polyhedron(sets.H, sets.h - sets.H @ np.concatenate([at.x, at.u]))
+        own.append(make(moved, sets))
+
+    def loops(models: Any, x0: np.ndarray) -> Trajectory:
+        parts = []
+        for k, at in enumerate(references):
+            runs = jax.tree.map(np.asarray, own[k](models, x0[k::r] - at.x))
+            lead = runs.batch_shape
+            fields = {"x": runs.x + at.x, "u": runs.u + at.u, "y": runs.y + at.y}
+            goals = {"x_r": at.x, "u_r": at.u, "y_r": at.y}
+            fields |= {n: np.broadcast_to(v, (*lead, v.size)) for n, v in goals.items()}
+            parts.append(bypass_init(Trajectory, **fields))
+        order = np.argsort(np.concatenate([np.arange(len(x0))[k::r] for k in range(r)]))
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves, axis=1)[:, order], *parts)
+
+    return loops
 
 
 def _checked(trajectory: Any, x0: np.ndarray) -> Trajectory:

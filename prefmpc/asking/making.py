@@ -185,7 +185,7 @@ def _shown(state: State, options: Options, belief: Belief, rng: np.random.Genera
     if options.pool is not None:
         pool = check_pool(options.pool(rng)) if callable(options.pool) else options.pool
         return pool_shown(pool, rng)
-    x0 = options.states.draw(STATES, rng)
+    x0 = options.starts(STATES, rng)
     models = belief.features.model(state.w[:CONTROLLERS])
     return loops_shown(options.loops, models, x0, rng)
 

@@ -13,6 +13,7 @@ from prefmpc._checks import (
     choice,
     function,
     instance,
+    instances,
     is_whole,
     nonnegative,
     positive,
@@ -25,10 +26,11 @@ from prefmpc.asking.belief import Belief, Prior
 from prefmpc.asking.criteria import CRITERIA
 from prefmpc.asking.features import FeatureMap, QuadraticFeatures, SeparableFeatures
 from prefmpc.asking.log import to_json
-from prefmpc.asking.loops import loops_of
+from prefmpc.asking.loops import Loops, loops_about, loops_of
 from prefmpc.asking.sources import States, check_pool
 from prefmpc.learning.priors import WishartPrior, bryson, free_entries
 from prefmpc.models.separable import SeparableCost
+from prefmpc.mpc.steady import SteadyState, check_reference
 from prefmpc.preferences.logs import FORMAT
 from prefmpc.preferences.trajectories import Trajectory, rollout
 from prefmpc.systems.linear import LinearSystem, System
@@ -54,6 +56,7 @@ class Options:
     coupling: Any
     steps: Any
     controller: Any
+    reference: Any
     horizon: Any
     constraints: Any
     pool: Any
@@ -86,9 +89,22 @@ class Options:
             self.prior = self._default_prior()
         self.features = self._features()
         self._check_stabilisable()
-        self.loops = loops_of(
-            self.system, self.controller, self.steps, self.horizon, self.constraints
-        )
+        self.loops = self._loops()
+
+    def _loops(self) -> Loops:
+        def make(system: Any, constraints: Polyhedron | None) -> Loops:
+            return loops_of(system, self.controller, self.steps, self.horizon, constraints)
+
+        if self.reference is None:
+            return make(self.system, self.constraints)
+        return loops_about(self.reference, self.system, self.constraints, make)
+
+    def starts(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Return x(0) (m, nx): ``count``, or all of a shorter list; for each set point one."""
+        x0 = self.states.draw(count, rng)
+        if self.reference is None or len(x0) >= len(self.reference):
+            return x0
+        return x0[np.arange(len(self.reference)) % len(x0)]
 
     def _check_sources(self) -> None:
         if callable(self.choose):
@@ -118,6 +134,22 @@ class Options:
                 raise ValueError("x0 must be given unless there is a pool of trajectories")
             self.x0 = np.unique(self.pool.x[:, 0], axis=0)
         self.states = States(self.x0, self.system.nx, self.constraints)
+        if self.reference is not None:
+            self._check_reference()
+
+    def _check_reference(self) -> None:
+        one = isinstance(self.reference, SteadyState)
+        self.reference = [self.reference] if one else self.reference
+        self.reference = instances("reference", self.reference, SteadyState)
+        if self.pool is not None or callable(self.controller):
+            raise ValueError(
+                "reference must be None with a pool or a controller of your own: their "
+                "trajectories hold x_r and u_r themselves"
+            )
+        if self.prior is None:
+            raise ValueError("prior must be given (bryson makes one) with a reference")
+        for at in self.reference:
+            check_reference(at, self.system, self.constraints, ingredients=False)
 
     def _default_prior(self) -> WishartPrior:
         """Return Bryson's rule with what the responses reach: those of a pool, or of a first guess.
@@ -196,6 +228,8 @@ class Options:
             line["prior"] = _parts(self.prior, ("c", "scale"))
         else:
             line["prior"] = _parts(self.prior, ("Q", "R", "strength"))
+        if self.reference is not None:
+            line["reference"] = [_parts(at, ("x", "u", "y")) for at in self.reference]
         if self.constraints is not None:
             line["constraints"] = _parts(self.constraints, ("H", "h"))
         return to_json({"prefmpc interview": FORMAT, **line})
@@ -204,6 +238,7 @@ class Options:
     def arguments(cls, line: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
         """Return the arguments of `Interview` from the head of a log, and what it cannot hold."""
         names = [field.name for field in dataclasses.fields(cls)]
+        line = {"reference": None, **line}  # of a log from before there were set points
         if missing := [name for name in names if name not in line]:
             raise ValueError(f"{missing[0]} is missing")
         out = {name: line[name] for name in names}
@@ -222,6 +257,12 @@ class Options:
         if "system" not in own:
             out["system"] = _made(LinearSystem, "system", out)
         out["prior"] = _made(SeparableCost if "c" in out["prior"] else WishartPrior, "prior", out)
+        if out["reference"] is not None:
+            if not isinstance(out["reference"], list):
+                raise ValueError(f"reference must be a list, got {out['reference']!r:.50}")
+            out["reference"] = [
+                _made(SteadyState, "reference", {"reference": at}) for at in out["reference"]
+            ]
         if out["constraints"] is not None:
             out["constraints"] = _made(Polyhedron, "constraints", out)
         if isinstance(out["pool"], dict):

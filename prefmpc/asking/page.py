@@ -238,6 +238,7 @@ def _check_supported(options: Options) -> None:
         ("structure", options.structure == "diagonal", '"diagonal"'),
         ("controller", options.controller == "lqr", '"lqr"'),
         ("pool", options.pool is None, "None"),
+        ("reference", options.reference is None, "None"),
         ("choose", options.choose == "information", '"information"'),
         ("x0", not callable(options.x0), "a radius or a list of states"),
     ):

@@ -11,8 +11,8 @@ from prefmpc.asking.loops import STATES
 from prefmpc.asking.options import Options
 from prefmpc.asking.questions import Question
 
-JUDGED = 100
-"""So many samples of the posterior say what the regret may be."""
+MARGIN = 1.645
+"""A bound leaves room for so many standard errors of the share of samples below it (95 %)."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -22,8 +22,8 @@ class Regret:
     Attributes
     ----------
     values : array (S,)
-        For each sample of the posterior: its own cost σ of the controller's closed loops, over
-        the least of all samples' controllers and of this one, minus 1.
+        For each sample of the posterior: its own cost σ of the controller's closed loops over
+        that of the controller that knows the sample, minus 1; 0 where this one does better.
     """
 
     values: np.ndarray
@@ -34,15 +34,26 @@ class Regret:
         return float(self.values.mean())
 
     def quantile(self, q: float = 0.9) -> float:
-        """Return the regret that is not exceeded with probability q."""
+        """Return the quantile q of the values."""
         return float(np.quantile(self.values, share("q", q)))
 
+    def bound(self, q: float = 0.9) -> float:
+        """Return what the regret is at most with probability q.
+
+        It is a higher quantile of the values, by `MARGIN` standard errors of a share q among so
+        many samples: somebody who asks after each answer whether it is enough would otherwise
+        stop when the samples happen to look good.
+        """
+        error = np.sqrt(share("q", q) * (1 - q) / len(self.values))
+        return float(np.quantile(self.values, min(q + MARGIN * error, 1.0)))
+
     def stop(self, level: float = 0.02, q: float = 0.9) -> bool:
-        """Return whether the regret is at most ``level`` with probability q."""
-        return self.quantile(q) <= nonnegative("level", level)
+        """Return whether the `bound` is at most ``level``."""
+        return self.bound(q) <= nonnegative("level", level)
 
     def __str__(self) -> str:
-        return f"{100 * self.quantile(0.5):.2g} % (median), {100 * self.quantile():.2g} % (90 %)"
+        median, bound = 100 * self.quantile(0.5), 100 * self.bound()
+        return f"{median:.2g} % (median), at most {bound:.2g} % with probability 0.9"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,16 +82,18 @@ def regret_of(present: np.ndarray, samples: np.ndarray, options: Options) -> Reg
 
     The x(0) are a function of the key alone, and the same for all.
     """
-    features, samples = options.features, samples[:JUDGED]
-    x0 = options.states.draw(STATES, options.rng(0, 2))
+    features = options.features
+    x0 = options.starts(STATES, options.rng(0, 2))
     runs = options.loops(features.model(np.concatenate([present[None], samples])), x0)
     phi = np.asarray(features(runs))  # (1 + S, m, p)
     reached = np.isfinite(phi[0]).all(axis=-1)
     if not reached.any():
         raise ValueError("x0 must hold a state from which the present controller reaches the end")
-    costs = samples @ phi[:, reached].mean(axis=1).T
-    # Saturated, a sample's own LQR need not be the best for it; who fails is not.
-    return Regret(costs[:, 0] / np.nanmin(costs, axis=1) - 1)
+    costs = samples @ phi[:, reached].mean(axis=1).T  # (S, 1 + S)
+    own = costs[:, 1:].diagonal()
+    # Of a sample whose own loops failed the best of the others is what is known.
+    best = np.where(np.isfinite(own), own, np.nanmin(costs, axis=1))
+    return Regret(np.maximum(costs[:, 0] / best - 1, 0))
 
 
 def consistency_of(questions: list[Question], labels: np.ndarray) -> Consistency:

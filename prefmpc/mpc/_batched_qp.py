@@ -140,9 +140,15 @@ def _moved(problem: CondensedProblem, multipliers: Any) -> Any:
 def _judged(
     data: _Data, w: Any, multipliers: Any, rows: Any, error: Any, n: int, count: Any, tol: Any
 ) -> _Search:
-    """Say how large the ``error`` of one of the first n rows is, beside the largest of them."""
-    inputs = jnp.maximum(jnp.abs(rows[..., :n]), 1e-6 * jnp.abs(data.free[..., :n]))
-    unit = inputs.max(-1)
+    """Say how large the ``error`` of one of the first n rows is, beside the largest of them.
+
+    A state that is held at its limit can take no input at all: what is left then is beside a
+    small part of what the input would be without limits, or can be.
+    """
+    free = jnp.abs(data.free[..., :n])
+    most = jnp.maximum(jnp.abs(data.lower), jnp.abs(data.upper))[..., :n]
+    little = jnp.maximum(1e-3 * jnp.minimum(free, most), 1e-6 * free)
+    unit = jnp.maximum(jnp.abs(rows[..., :n]), little).max(-1)
     some = (error > 0) & (unit > 0)
     residual = jnp.where(some, error / jnp.where(some, unit, 1.0), error)
     # XLA's max passes over NaN: what is not finite would look exact.

@@ -19,7 +19,8 @@
   const TOLERANCE = 1e-9; // of the certificate; the search itself goes on to
   const POLISHED = 1e-18;
   const ROUGH = 1e-4; // where a search stopped further from a minimum, its level has no say
-  const FLAT = 1e-3; // no curvature counts as less than this share of the prior's
+  const FLAT = 1e-3; // no curvature counts as less than this share of the prior's for a step,
+  const WIDE = 0.25; // nor less than this for a Gaussian: nowhere is it wider than twice the prior
   const ROUNDS = 30;
 
   const logistic = (z) => (z >= 0 ? 1 / (1 + Math.exp(-z)) : Math.exp(z) / (1 + Math.exp(z)));
@@ -159,26 +160,41 @@
       }
       if (!found) break;
     }
-    const size = values.map((value) => Math.max(value, FLAT));
+    const size = values.map((value) => Math.max(value, WIDE));
     const evidence = -now - 0.5 * size.reduce((sum, s) => sum + Math.log(s), 0) - 0.5 * level ** 2;
+    // The symmetric root, since the signs of eigenvectors are arbitrary.
+    const scaled = vectors.map((row) => row.map((value, i) => value / Math.sqrt(size[i])));
     return {
       at, evidence, decrement: Number.isFinite(now) ? decrement : Infinity, curvature: values[0],
-      root: vectors.map((row) => row.map((value, i) => value / Math.sqrt(size[i]))),
+      root: scaled.map((row) => times(vectors, row)),
     };
   }
 
-  // Samples of the posterior: elliptical slice sampling about Laplace's Gaussians, all chains at
-  // once. Each starts from a draw and is moved `slices` times at its level.
+  // Samples of the posterior, all chains at once: each starts from a draw of Laplace's Gaussians
+  // and is moved `slices` times, within its level by elliptical slice sampling, and then to one
+  // of the two next levels, or not, by Metropolis's rule.
   function draws(b, laplace, answers, count, slices, source) {
     const q = laplace.at[0].length, lapse = q === b.p - 1 ? b.lapse : null;
     const which = uniforms(source, count).map((u) => chosen(laplace.weights, u));
     const x = normals(source, count, q);
-    const point = (x, i) => times(laplace.roots[which[i]], x).map((v, j) => laplace.at[which[i]][j] + v);
-    const excess = (x, i) =>
-      0.5 * dot(x, x) - energy(b, point(x, i), LEVELS[which[i]], answers, lapse);
+    const point = (x, k) => times(laplace.roots[k], x).map((v, j) => laplace.at[k][j] + v);
+    const excessAt = (x, k) => 0.5 * dot(x, x) - energy(b, point(x, k), LEVELS[k], answers, lapse);
+    const excess = (x, i) => excessAt(x, which[i]);
+    const constant = laplace.roots.map((root, k) =>
+      eigen(root).values.reduce((sum, v) => sum + Math.log(v), 0) - 0.5 * LEVELS[k] ** 2);
     const height = slices ? x.map(excess) : [];
-    for (let k = 0; k < slices; k++) slice(x, height, excess, source);
-    const at = x.map(point);
+    for (let round = 0; round < slices; round++) {
+      slice(x, height, excess, source);
+      const steps = uniforms(source, count).map((u) => (u < 0.5 ? -1 : 1));
+      const chances = uniforms(source, count);
+      for (let i = 0; i < count; i++) {
+        const from = which[i], to = Math.min(Math.max(from + steps[i], 0), LEVELS.length - 1);
+        const there = excessAt(x[i], to);
+        const gain = there + constant[to] - height[i] - constant[from];
+        if (Math.log(chances[i]) < gain) [which[i], height[i]] = [to, there];
+      }
+    }
+    const at = x.map((place, i) => point(place, which[i]));
     return {
       eta: at.map((place, i) => etaOf(b, place, LEVELS[which[i]])),
       lapse: at.map((place) => (lapse === null ? rateOf(place) : lapse)),

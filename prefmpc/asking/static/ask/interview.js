@@ -19,10 +19,9 @@
   const DEFAULTS = Object.freeze({
     spread: 2, sharpness: 2, coupling: 0.5, steps: 20, lapse: 0, repeatEvery: 8,
     samples: 150, // draws from the posterior, each moved so often:
-    slices: 5,
+    slices: 15,
     controllers: 12, // so many of them make loops, from so many states, for one question
     states: 12,
-    judged: 100, // so many say what the regret may be, from as many states
     level: 0.02, // enough: the regret is at most this with this probability
     certain: 0.9,
     most: Infinity, // so many answers are as much as can be asked of anybody
@@ -70,11 +69,11 @@
     });
 
     const regret = (n) => once("regret", n, () => {
-      const { mean, samples } = state(n), judged = samples.w.slice(0, options.judged);
-      return ask.questions.regret(config, options, mean, judged, x0);
+      const { mean, samples } = state(n);
+      return ask.questions.regret(config, options, mean, samples.w, x0);
     });
 
-    const bound = (n) => quantile(regret(n), options.certain);
+    const bound = (n) => ask.questions.bound(regret(n), options.certain);
 
     function progress() {
       const n = answers.length, { mean, samples } = state(n);
@@ -171,7 +170,7 @@
       prior: { Q: diag(Q), R: diag(R), strength: 1 },
       x0: options.radius, key, structure: "diagonal", spread: options.spread,
       sharpness: options.sharpness, coupling: options.coupling, steps: options.steps,
-      controller: "lqr", horizon: 10, constraints: null, pool: null, choose: "information",
+      controller: "lqr", reference: null, horizon: 10, constraints: null, pool: null, choose: "information",
       lapse: options.lapse, repeat_every: options.repeatEvery, samples: options.samples,
     };
   }

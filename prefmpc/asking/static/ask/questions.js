@@ -2,7 +2,7 @@
 // alike the one whose answer tells most.
 (function (ask) {
   "use strict";
-  const { dot } = ask.linalg;
+  const { dot, quantile } = ask.linalg;
   const { logistic } = ask.belief;
   const { features, gainOf, loop, loopFeatures } = ask.plant;
 
@@ -104,8 +104,8 @@
     return question(...sides, P, number, null);
   }
 
-  // For each sample: its own cost of the loops of the present weights over that of the best
-  // controller, minus 1. (Saturated, a sample's own LQR need not be the best for it.)
+  // For each sample: its own cost of the loops of the present weights over that of the controller
+  // that knows it, minus 1; 0 where the present one does better.
   function regret(plant, options, present, samples, x0) {
     const all = [present, ...samples];
     const found = candidates(plant, options.centre, all, x0, options.steps);
@@ -116,12 +116,19 @@
       loops[candidate.source] += 1;
       candidate.phi.forEach((value, i) => { phi[candidate.source][i] += value; });
     }
-    const ended = phi.filter((_, i) => loops[i] === reached.size);
-    return samples.map((w) => {
-      const costs = ended.map((sums) => dot(w, sums));
-      return costs[0] / Math.min(...costs) - 1;
+    const ended = loops.map((count) => count === reached.size);
+    return samples.map((w, s) => {
+      // Of a sample whose own loops failed the best of the others is what is known.
+      const best = ended[s + 1] ? dot(w, phi[s + 1])
+        : Math.min(...phi.filter((_, i) => ended[i]).map((sums) => dot(w, sums)));
+      return Math.max(dot(w, phi[0]) / best - 1, 0);
     });
   }
 
-  ask.questions = { candidates, entropy, gains, information, next, pairs, probabilities, regret };
+  // What the regret is at most with probability q: a higher quantile of the values, by 1.645
+  // standard errors of a share q among so many.
+  const bound = (values, q) =>
+    quantile(values, Math.min(q + 1.645 * Math.sqrt(q * (1 - q) / values.length), 1));
+
+  ask.questions = { bound, candidates, entropy, gains, information, next, pairs, probabilities, regret };
 })(globalThis.prefmpcAsk = globalThis.prefmpcAsk || {});
