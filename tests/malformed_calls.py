@@ -53,6 +53,11 @@ def asked(**options):
     return p.ask(**options)
 
 
+def exported(**options):
+    with tempfile.TemporaryDirectory() as folder:
+        p.export_c(folder=Path(folder, "mpc"), **options)
+
+
 @cache
 def AN_INTERVIEW():
     return p.Interview(SYSTEM, PRIOR, x0=np.ones(2), key=0, samples=20, steps=3)
@@ -66,6 +71,7 @@ def without(function, *names):
 
 unlogged.__signature__ = without(p.Interview, "log")
 asked.__signature__ = without(p.ask, "log", "who")
+exported.__signature__ = without(p.export_c, "folder")
 shown.__signature__ = without(p.Interview.to_html, "self", "path")
 
 
@@ -343,6 +349,14 @@ def valid_calls():
             {
                 **{"x0": np.ones(2), "reference": target, "u_before": np.ones(1)},
                 "start": np.zeros((3, 1)),
+            },
+        ),
+        "export_c": (
+            exported,
+            {
+                **{"controller": p.LinearMPC(SYSTEM, COST, 3), "precision": "double"},
+                **{"tol": 1e-6, "max_iterations": 100, "states": np.ones((1, 2))},
+                **{"reference": target, "steps": 2, "overwrite": False},
             },
         ),
         "ReferenceTracker": (

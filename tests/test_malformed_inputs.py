@@ -26,7 +26,15 @@ EXEMPT = {
     **dict.fromkeys(["FitError", "MPCError"], "an error"),
     **dict.fromkeys(
         [
-            *("ClosedLoops", "FitResult", "GlobalResult", "Interval", "MPCSolution", "Moments"),
+            *(
+                "CExport",
+                "ClosedLoops",
+                "FitResult",
+                "GlobalResult",
+                "Interval",
+                "MPCSolution",
+                "Moments",
+            ),
             *(
                 "NetworkFit",
                 "Posterior",

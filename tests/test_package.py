@@ -19,7 +19,7 @@ import pytest
 
 import prefmpc
 
-LINES, CODE = 15_200, 10_000
+LINES, CODE = 16_800, 11_200
 """The library has at most so many lines, and so many without docstrings, comments and blanks."""
 
 FILE, FUNCTION, HOUR = 350, 60, 3_500
@@ -254,7 +254,8 @@ def test_the_wheel_holds_the_library_and_no_studies():
     built = {str(Path(line).relative_to("build/lib")) for line in listed.split()}
     there = {str(path.relative_to(ROOT.parent)) for path in ROOT.rglob("*.py")}
     scripts = {str(path.relative_to(ROOT.parent)) for path in ROOT.rglob("static/ask/*.*")}
-    assert built == there | scripts | {"prefmpc/py.typed"}
+    in_c = {str(path.relative_to(ROOT.parent)) for path in ROOT.glob("mpc/static/*")}
+    assert built == there | scripts | in_c | {"prefmpc/py.typed"}
     assert len(scripts) > 15
 
 
@@ -270,6 +271,7 @@ def test_no_module_depends_on_itself():
 # These are made by the library, or hold no input of their own.
 MADE = {
     *(
+        "CExport",
         "ClosedLoops",
         "CostModel",
         "FitError",

@@ -2,6 +2,8 @@
 
 from prefmpc.mpc.batched import BatchedMPC
 from prefmpc.mpc.convex import ConvexMPC
+from prefmpc.mpc.export import CExport, export_c
+from prefmpc.mpc.feedback import KalmanEstimator, OutputFeedback
 from prefmpc.mpc.loops import ClosedLoops, closed_loops, mpc_rollout
 from prefmpc.mpc.nonlinear import NonlinearMPC
 from prefmpc.mpc.qp import LinearMPC
@@ -13,18 +15,22 @@ from prefmpc.mpc.tracking import ReferenceTracker
 
 __all__ = [
     "BatchedMPC",
+    "CExport",
     "ClosedLoops",
     "ConvexMPC",
+    "KalmanEstimator",
     "LinearMPC",
     "MPCError",
     "MPCSolution",
     "NonlinearMPC",
+    "OutputFeedback",
     "ReferenceTracker",
     "StabilityCheck",
     "SteadyState",
     "TerminalIngredients",
     "check_stability",
     "closed_loops",
+    "export_c",
     "mpc_rollout",
     "steady_state",
     "terminal_ingredients",

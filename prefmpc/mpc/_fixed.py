@@ -17,6 +17,8 @@ class FixedRows:
     stage : bool array (N, m)
         Which rows of ``constraints`` no input moves at stage k.
     last : bool array (rows of ``terminal``,)
+
+    Rows of ``constraints`` that are ``soft`` (m,) may be broken.
     """
 
     def __init__(
@@ -25,6 +27,7 @@ class FixedRows:
         horizon: int,
         constraints: Polyhedron | None,
         terminal: Polyhedron | None,
+        soft: np.ndarray | None = None,
     ) -> None:
         nx = system.nx
         none = Polyhedron(np.zeros((0, nx + system.nu)), np.zeros(0))
@@ -34,24 +37,31 @@ class FixedRows:
         self.last = unmoved(system.A, system.B, end.H, None, horizon + 1)[-1]
         maps, rows, limits = [np.zeros((0, nx))], [np.zeros((0, nx))], [np.zeros(0)]
         power = np.eye(nx)
-        for mask in self.stage:
+        stages, last = [np.zeros(0, int)], np.full(self.last.sum(), horizon)
+        for k, mask in enumerate(self.stage if soft is None else self.stage & ~soft):
             if mask.any():
                 maps.append(H[mask] @ power)
                 rows.append(H[mask])
                 limits.append(Z.h[mask])
+                stages.append(np.full(mask.sum(), k))
             power = power @ system.A
         maps.append(end.H[self.last] @ power)
         rows.append(end.H[self.last])
         limits.append(end.h[self.last])
         self._map, self._rows = np.concatenate(maps), np.concatenate(rows)
-        self._limits = np.concatenate(limits)
+        self._limits, self._stages = np.concatenate(limits), np.concatenate([*stages, last])
         self._plant = system.A, system.B, input_size(system.u_min, system.u_max)
 
-    def broken(self, x0: np.ndarray) -> bool:
-        """Say whether one of them is broken from x0 (nx,), by more than counts as on the limit."""
+    def broken(self, x0: np.ndarray, pushed: np.ndarray | None = None) -> bool:
+        """Say whether one of them is broken from x0 (nx,), by more than counts as on the limit.
+
+        ``pushed`` (N + 1, nx) is what a disturbance adds to the states, if there is one.
+        """
         if not len(self._limits):
             return False
         beyond = self._map @ x0 - self._limits
+        if pushed is not None:
+            beyond += (self._rows * pushed[self._stages]).sum(axis=1)
         if not (beyond > 0).any():
             return False
         sizes = row_sizes(*self._plant, x0, self._rows, self._limits)

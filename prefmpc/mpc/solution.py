@@ -51,6 +51,9 @@ class MPCSolution(Result):
         of its terms.
     seconds : float
         Wall time of the solve.
+    broken : array (N, m), optional
+        By how much the plan breaks each soft row of the constraints at each stage, in the row's
+        own unit, 0 where it keeps to it; None without soft rows.
     """
 
     GOOD = "solved"
@@ -63,6 +66,7 @@ class MPCSolution(Result):
     iterations: Any
     residual: Any
     seconds: float
+    broken: np.ndarray | None = None
 
     def _error(self) -> MPCError:
         return MPCError(self)

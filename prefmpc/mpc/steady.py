@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,6 +41,7 @@ def steady_state(
     constraints: Polyhedron | None = None,
     start: tuple[ArrayLike, ArrayLike] | None = None,
     nearest: bool = False,
+    disturbance: ArrayLike | None = None,
 ) -> SteadyState:
     """Return the steady state with the output y_r and, if there are several, the smallest.
 
@@ -58,6 +60,8 @@ def steady_state(
         taken from this x. Default: the origin, hence no disturbance.
     nearest : bool
         Return the steady state whose output is nearest to y_r, if it cannot be reached.
+    disturbance : array (nx,), optional
+        Of a linear plant: what is added to every next state, x = A x + B u + d.
 
     Raises
     ------
@@ -77,7 +81,12 @@ def steady_state(
         x = np.asarray(shaped("start[0]", finite_array("start[0]", given[0], ndim=1), (system.nx,)))
         u = np.asarray(shaped("start[1]", finite_array("start[1]", given[1], ndim=1), (system.nu,)))
     Z = stage_constraints(system, constraints)
-    search = _held if isinstance(system, LinearSystem) else _search
+    search: Any = _held if isinstance(system, LinearSystem) else _search
+    if disturbance is not None:
+        if not isinstance(system, LinearSystem):
+            raise ValueError("disturbance must be None for a plant that is not linear")
+        d = np.asarray(finite_array("disturbance", disturbance, ndim=1))
+        search = partial(_held, push=np.asarray(shaped("disturbance", d, (system.nx,))))
     found = search(system, wanted, Z, x, u)
     if found is None:
         within = " within the constraints" if len(Z.h) else ""
@@ -99,9 +108,16 @@ def steady_state(
 
 
 def check_reference(
-    reference: Any, system: System, constraints: Polyhedron | None, ingredients: bool
+    reference: Any,
+    system: System,
+    constraints: Polyhedron | None,
+    ingredients: bool,
+    push: np.ndarray | None = None,
 ) -> None:
-    """Raise a ValueError unless the set point fits plant, constraints and terminal set."""
+    """Raise a ValueError unless the set point fits plant, constraints and terminal set.
+
+    ``push`` (nx,) is added to every next state.
+    """
     instance("reference", reference, SteadyState)
     check_dimension("reference", reference.x.size, system.nx)
     check_dimension("reference", reference.u.size, system.nu)
@@ -111,7 +127,8 @@ def check_reference(
     room = REACHED * np.maximum(np.abs(Z.h), np.abs(Z.H) @ np.abs(z))
     if not (Z.H @ z <= Z.h + room).all():
         raise ValueError(f"reference must satisfy the constraints, got x, u = {z}")
-    drift = np.abs(np.asarray(system.step(reference.x, reference.u)) - reference.x)
+    after = np.asarray(system.step(reference.x, reference.u))
+    drift = np.abs((after if push is None else after + push) - reference.x)
     size: Any = 1 + np.abs(z).max()
     if isinstance(system, LinearSystem):
         rows = np.concatenate([system.A, system.B], axis=1)
@@ -153,12 +170,18 @@ def _reached(system: System, found: SteadyState, wanted: np.ndarray) -> bool:
 
 
 def _held(
-    system: Any, wanted: np.ndarray, Z: Polyhedron | None, x: np.ndarray, u: np.ndarray
+    system: Any,
+    wanted: np.ndarray,
+    Z: Polyhedron | None,
+    x: np.ndarray,
+    u: np.ndarray,
+    push: np.ndarray | None = None,
 ) -> SteadyState | None:
     """Return what a linear plant can hold, with what no input moves as in x."""
     A, B, C = system.A, system.B, system.C
     sizes = input_sizes(A, B, C, system.u_min, system.u_max)
-    z = Target(A, B, C, np.zeros(len(A)), wanted, sizes, keep=x).solve(Z)
+    right = np.zeros(len(A)) if push is None else -push
+    z = Target(A, B, C, right, wanted, sizes, keep=x).solve(Z)
     return None if z is None else _point(system, z, Z)
 
 
