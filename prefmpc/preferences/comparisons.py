@@ -56,7 +56,7 @@ class Comparisons:
     def __init__(
         self, trajectories: Trajectory, first: ArrayLike, second: ArrayLike, labels: ArrayLike
     ) -> None:
-        _check_pool(trajectories)
+        check_pool(trajectories)
         labels = np.asarray(finite_array("labels", labels, ndim=1, booleans=True))
         if labels.size == 0:
             raise ValueError("labels must hold at least one comparison, got an empty data set")
@@ -100,7 +100,7 @@ class Comparisons:
             Draw only pairs with the same x(0), so that nothing but the control differs. The
             trajectories must then hold some that start alike (see `lqr_pool`).
         """
-        _check_pool(trajectories)
+        check_pool(trajectories)
         function("preference", preference, 2)
         size = positive_int("size", size)
         count = len(trajectories)
@@ -263,7 +263,8 @@ def _recorded(side: str, x: ArrayLike, u: ArrayLike, y: ArrayLike | None) -> Tra
         raise ValueError(f"{names} do not fit: {error}") from None
 
 
-def _check_pool(trajectories: Any) -> None:
+def check_pool(trajectories: Any) -> None:
+    """Raise a ValueError unless these are trajectories with one leading dimension, all finite."""
     if not isinstance(trajectories, Trajectory):
         raise ValueError(
             f"trajectories must be a Trajectory, got {type(trajectories).__name__}; "
