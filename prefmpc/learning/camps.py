@@ -13,8 +13,9 @@ from scipy.special import gammaln, logsumexp, softmax
 from prefmpc._checks import nonnegative, number, positive_int
 from prefmpc._random import generator
 from prefmpc._results import Result, warn_of_failure
-from prefmpc.learning._people import Answers, Form, Mode, minimise
-from prefmpc.learning.people import answers_of, costs, form_of
+from prefmpc.learning._answers import Answers, answers_of, costs
+from prefmpc.learning._people import Form, Mode, minimise
+from prefmpc.learning.people import form_of
 from prefmpc.learning.priors import WishartPrior
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.preferences.comparisons import Comparisons
@@ -160,7 +161,9 @@ def find_camps(
         tries = [_search(answers, form, count, rng) for _ in range(starts if count > 1 else 1)]
         found.append(max(tries, key=lambda t: (t.certified, t.log_evidence)))
     evidence = np.array([mixture.log_evidence for mixture in found])
-    chosen = next(k for k in range(len(found)) if (evidence[k:] - evidence[k]).max() <= np.log(odds))
+    chosen = next(
+        k for k in range(len(found)) if (evidence[k:] - evidence[k]).max() <= np.log(odds)
+    )
     out = _result(answers, form, found[chosen], evidence)
     warn_of_failure(out)
     if out.count > 1:

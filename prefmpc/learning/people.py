@@ -17,16 +17,14 @@ from scipy.optimize import minimize_scalar
 from scipy.special import expit, ndtri
 
 from prefmpc._checks import (
-    finite_array,
     instance,
-    nonnegative,
     number,
     positive,
-    require_x64,
     share,
 )
 from prefmpc._results import Result, warn_of_failure
-from prefmpc.learning._people import Answers, Form, Mode, form, minimise, ratios
+from prefmpc.learning._answers import Answers, answers_of, costs
+from prefmpc.learning._people import Form, Mode, form, minimise
 from prefmpc.learning.convex import Interval
 from prefmpc.learning.priors import WishartPrior
 from prefmpc.models.quadratic import QuadraticCost
@@ -169,7 +167,9 @@ class PeopleResult(Result):
         values, vectors = np.linalg.eigh(both)
         kept = values > 1e-12 * values[-1]
         lapse = old.own[:, old.own[-1] != 0]
-        new = Form(old.centre + old.shared @ self.mode.u, vectors[:, kept] * values[kept] ** 0.5, lapse)
+        new = Form(
+            old.centre + old.shared @ self.mode.u, vectors[:, kept] * values[kept] ** 0.5, lapse
+        )
         result = _result(answers, new, minimise(answers, new), self.apart, began)
         warn_of_failure(result)
         return result
@@ -295,30 +295,6 @@ def fit_hierarchy(
     return result
 
 
-def answers_of(
-    comparisons: Comparisons,
-    prior: WishartPrior,
-    weights: ArrayLike | None = None,
-    who: np.ndarray | None = None,
-) -> Answers:
-    """Return what the fits see, by people; a ValueError if something does not fit."""
-    require_x64()
-    instance("comparisons", comparisons, Comparisons)
-    instance("prior", prior, WishartPrior)
-    who = comparisons.who if who is None else who
-    if who is None:
-        raise ValueError("comparisons must say who answered: Comparisons(..., who=[...])")
-    n = len(comparisons)
-    counts = np.ones(n) if weights is None else np.asarray(finite_array("weights", weights))
-    if counts.shape != (n,) or (counts < 0).any() or not counts.any():
-        raise ValueError(
-            f"weights must be {n} numbers of at least 0 and not all 0, one for each answer, "
-            f"got shape {counts.shape}"
-        )
-    diagonal = WishartPrior(*(np.diag(np.diag(mode)) for mode in (prior.Q, prior.R)))
-    return Answers.of(comparisons, diagonal, counts, who)
-
-
 def form_of(
     answers: Answers, spread: Any, sharpness: Any, apart: float, sharper: Any, lapse: Any
 ) -> Form:
@@ -332,17 +308,7 @@ def form_of(
     return form(len(answers.mode), *sizes, apart, sharper, rate)
 
 
-def costs(answers: Answers, log_weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return Q (..., nx, nx) and R (..., nu, nu) in the user's units."""
-    w = np.exp(log_weights) * answers.mode
-    parts = np.split(w, [w.shape[-1] - answers.nu], axis=-1)
-    Q, R = (part[..., None] * np.eye(part.shape[-1]) for part in parts)
-    return Q, R
-
-
-def _result(
-    answers: Answers, wanted: Form, mode: Mode, apart: float, began: float
-) -> PeopleResult:
+def _result(answers: Answers, wanted: Form, mode: Mode, apart: float, began: float) -> PeopleResult:
     centre = wanted.centre + wanted.shared @ mode.u
     Q, R = costs(answers, centre[:-1])
     finite = all(np.isfinite(part).all() for part in (Q, R, mode.energy, mode.log_evidence))

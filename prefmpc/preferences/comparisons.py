@@ -262,8 +262,8 @@ class Comparisons:
             )
         optional = {name: stored[name] for name in _OPTIONAL if name in stored}
         trajectories = Trajectory(stored["x"], stored["u"], stored["y"], **optional)
-        pairs = (stored.get(name) for name in ("first", "second", "labels", "who"))
-        return cls(trajectories, *pairs)
+        first, second, labels = (stored[name] for name in ("first", "second", "labels"))
+        return cls(trajectories, first, second, labels, stored.get("who"))
 
 
 def compared(first: list[Trajectory], second: list[Trajectory], labels: np.ndarray) -> Comparisons:
