@@ -30,7 +30,12 @@ def some_answers(seed, per_kind=6):
             Answers(pool, np.stack([first, second], 1), np.full(n, 2), rng.uniform(size=n)),
             Answers.from_labels(pool, first, second, list(ties), coding="words"),
             Answers.from_labels(
-                pool, first, second, list(rng.choice(list(strengths), n)), coding=strengths, grades=5
+                pool,
+                first,
+                second,
+                list(rng.choice(list(strengths), n)),
+                coding=strengths,
+                grades=5,
             ),
             Answers.from_labels(
                 pool, first, second, list(rng.integers(0, 4, n)), coding=four, grades=4
@@ -93,9 +98,7 @@ def in_cvxpy(answers, prior, spread, diagonal=False):
     nx, nu = len(prior.Q), len(prior.R)
     Q = cp.diag(cp.Variable(nx)) if diagonal else cp.Variable((nx, nx), symmetric=True)
     R = cp.diag(cp.Variable(nu)) if diagonal else cp.Variable((nu, nu), symmetric=True)
-    sigma = [
-        cp.trace((a.T @ a) @ Q) + cp.trace((b.T @ b) @ R) for a, b in zip(x, u, strict=True)
-    ]
+    sigma = [cp.trace((a.T @ a) @ Q) + cp.trace((b.T @ b) @ R) for a, b in zip(x, u, strict=True)]
     sizes = {"acceptable": 1, "tie": 1, "4 grades": 1, "5 grades": 2, "5 stars": 4}
     t = {name: cp.Variable(size) for name, size in sizes.items()}
     cost = minus_log_likelihood(

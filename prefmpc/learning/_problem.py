@@ -67,7 +67,7 @@ class Problem:
     """(p, size): second moments of the second trajectory minus those of the first."""
     labels: np.ndarray
     weights: np.ndarray
-    """(size,): 1 for a comparison, 0 for padding."""
+    """(size,): 0 for padding, else as how many answers it counts, mostly 1."""
     mode: np.ndarray
     strength: float
     nu: int
@@ -128,10 +128,11 @@ def build(
     entries: Entries,
     outputs: np.ndarray | None,
     size: int,
+    counts: np.ndarray | None = None,
 ) -> list[Problem]:
     """Prepare one problem for each prior, all in the units of the first.
 
-    Padded to ``size`` comparisons with some of weight 0.
+    Padded to ``size`` comparisons with some of weight 0; the others weigh ``counts`` (n,) or 1.
     """
     n = len(comparisons)
     modes = [_block_diagonal(prior.Q, prior.R) for prior in priors]
@@ -141,7 +142,7 @@ def build(
     np.take(pool, comparisons.second, axis=1, out=gap[:, :n])
     gap[:, :n] -= pool.take(comparisons.first, axis=1)
     labels, weights = np.zeros(size), np.zeros(size)
-    labels[:n], weights[:n] = comparisons.labels, 1.0
+    labels[:n], weights[:n] = comparisons.labels, 1.0 if counts is None else counts
     data = entries, unit, outputs, gap, labels, weights
     return [
         Problem(*data, W0 * unit * unit[:, None], float(prior.strength), len(prior.R))
@@ -177,6 +178,16 @@ def build_answers(
         *(entries, unit, outputs, *pairs, mode, float(prior.strength), len(prior.R)),
         *(wide, thresholds, 10.0 * (1 + size)),
     )
+
+
+def answer_weights(value: Any, n: int) -> np.ndarray:
+    """Return as how many answers each one counts (n,), or raise a ValueError."""
+    weights = np.ones(n) if value is None else np.asarray(finite_array("weights", value))
+    if weights.shape != (n,):
+        raise ValueError(f"weights must have shape ({n},), one an answer, got {weights.shape}")
+    if weights.min() < 0 or not weights.any():
+        raise ValueError(f"weights must be not negative and not all 0, got {weights}")
+    return weights
 
 
 def check(

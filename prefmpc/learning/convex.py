@@ -29,7 +29,7 @@ from prefmpc._checks import (
 from prefmpc._results import Result, warn_of_failure
 from prefmpc._sharding import check_mesh
 from prefmpc.learning._newton import Minimum, solve
-from prefmpc.learning._problem import Problem, build, build_answers, check
+from prefmpc.learning._problem import Problem, answer_weights, build, build_answers, check
 from prefmpc.learning.losses import padded_size
 from prefmpc.learning.priors import Structure, WishartPrior
 from prefmpc.models.quadratic import QuadraticCost
@@ -193,7 +193,9 @@ class MapResult(Result):
         """
         Q0, R0 = (np.diag(np.diag(mode)) for mode in (self.prior.Q, self.prior.R))
         prior = WishartPrior(Q0, R0, self.prior.strength)
-        return fit_map(self.comparisons, prior, structure="diagonal", outputs=self.outputs)
+        weights = self.problem.weights[: len(self.comparisons)]
+        data = self.comparisons, prior
+        return fit_map(*data, structure="diagonal", outputs=self.outputs, weights=weights)
 
 
 def fit_map(
@@ -202,6 +204,7 @@ def fit_map(
     *,
     structure: Structure = "full",
     outputs: ArrayLike | None = None,
+    weights: ArrayLike | None = None,
     max_iterations: int = 100,
     tol: float = 1e-8,
     mesh: Mesh | None = None,
@@ -230,6 +233,8 @@ def fit_map(
     outputs : array (ny, nx), optional
         C of y = C x: σ then sees outputs and inputs only. The prior weighs y, and the result is
         Q = CᵀQ_yC.
+    weights : array (n,), optional
+        As how many answers each one counts, at least 0; see `forgetting`. The problem stays convex.
     tol : float
         Stop when half the squared Newton decrement is below ``tol`` times 1 + abs(objective).
     mesh : jax.sharding.Mesh, optional
@@ -249,8 +254,12 @@ def fit_map(
     instance("prior", prior, WishartPrior)
     if mesh is not None and isinstance(comparisons, Answers):
         raise ValueError("mesh must be None for Answers: it shares Comparisons only")
+    if weights is not None and isinstance(comparisons, Answers):
+        raise ValueError("weights must be None for Answers: those of Comparisons count as many")
     mesh = None if mesh is None else check_mesh(mesh)
-    result = _solved([comparisons], [prior], structure, outputs, max_iterations, tol, mesh)[0]
+    counts = answer_weights(weights, len(comparisons))
+    options = structure, outputs, max_iterations, tol, mesh, counts
+    result = _solved([comparisons], [prior], *options)[0]
     warn_of_failure(result)
     return result
 
@@ -313,6 +322,7 @@ def _solved(
     max_iterations: int,
     tol: float,
     mesh: Mesh | None = None,
+    weights: np.ndarray | None = None,
 ) -> list[MapResult]:
     require_x64()
     began = time.perf_counter()
@@ -323,7 +333,7 @@ def _solved(
     if isinstance(data_sets[0], Answers):
         problems = [build_answers(data_sets[0], priors[0], entries, C)]
     elif all(data is data_sets[0] for data in data_sets):
-        problems = build(data_sets[0], priors, entries, C, size)
+        problems = build(data_sets[0], priors, entries, C, size, weights)
     else:
         pairs = zip(data_sets, priors, strict=True)
         problems = [build(data, [prior], entries, C, size)[0] for data, prior in pairs]
