@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from studies import (
+    answers,
     asking,
     asking_limits,
     lane,
@@ -90,6 +91,11 @@ STUDIES: dict[str, Study] = {
             **{"sizes": onesided.ONESIDED_SIZES, "learners": onesided.LEARNERS},
             "controllers": onesided.CONTROLLERS,
         },
+    ),
+    "answers": (
+        answers.answers_case,
+        "extensions/answers_spread.json",
+        {"people": answers.PEOPLE, "learners": answers.LEARNERS, "counts": answers.COUNTS},
     ),
     "asking": (
         asking.asking_case,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -291,7 +291,7 @@ def newton(
 
 _one = jax.jit(newton)
 _shared, _many = (
-    jax.jit(jax.vmap(newton, in_axes=(Data(gap, 0, 0, None), None, 0, 0, None, None, None)))
+    jax.jit(jax.vmap(newton, in_axes=(Data(gap, 0, 0, ()), None, 0, 0, None, None, None)))
     for gap in (None, 0)
 )
 
@@ -300,12 +300,8 @@ _shared, _many = (
 def _over(axes: Any) -> Callable[..., Minimum]:
     """Return `newton` for comparisons shared along these axes of a mesh."""
 
-    def shared(gap: Any, labels: Any, weights: Any, *rest: Any) -> Minimum:
-        return newton(
-            Data(gap, labels, weights), *rest, total=lambda value: jax.lax.psum(value, axes)
-        )
-
-    return shared
+    run = partial(newton, total=lambda value: jax.lax.psum(value, axes))
+    return lambda gap, labels, weights, *rest: run(Data(gap, labels, weights), *rest)
 
 
 def solve(

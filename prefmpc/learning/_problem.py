@@ -167,7 +167,7 @@ def build_answers(
     thresholds = Thresholds.of(answers)
     pairs, wide = gaps(answers, thresholds, pool, padded_size)
     mode = W0 * unit * unit[:, None]
-    w = np.concatenate([mode[entries.rows, entries.columns], np.zeros(thresholds.count)])
+    w = np.concatenate([mode[entries.rows, entries.columns], np.zeros(thresholds.total)])
     expected = Data(*pairs, wide).logits(w)
     count = sum(
         float(z[..., weights > 0].size)

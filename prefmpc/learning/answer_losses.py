@@ -133,7 +133,7 @@ class Task(NamedTuple):
         first = Thresholds.of(answers[0])
         data = choice_data(starts, answers[0], thresholds)
         sigma = np.asarray(jax.vmap(data.costs)(starts))
-        values = np.zeros((len(sigma), thresholds.count))
+        values = np.zeros((len(sigma), thresholds.total))
         for (size, grades), place in thresholds.places.items():
             if size == 1 and (size, grades) in first.places:
                 about = (answers[0].sizes == 1) & (answers[0].grades == grades)

@@ -39,7 +39,7 @@ class Thresholds(NamedTuple):
     """Which thresholds a data set has: of (how many were shown, grades) a slice of all of them."""
 
     places: dict[tuple[int, int], slice]
-    count: int
+    total: int
 
     @classmethod
     def of(cls, *sets: Answers) -> Thresholds:
@@ -54,7 +54,7 @@ class Thresholds(NamedTuple):
         return cls(places, count)
 
     def named(self, values: Any) -> dict[str, np.ndarray]:
-        """Return thresholds (..., count) by name."""
+        """Return thresholds (..., total) by name."""
         names = {(1, 2): "acceptable", (2, 3): "tie"}
         return {
             names.get(kind, f"{kind[1]} {'stars' if kind[0] == 1 else 'grades'}"): np.asarray(
@@ -86,7 +86,7 @@ class Choices(NamedTuple):
 
 def choices_of(answers: Answers, thresholds: Thresholds) -> tuple[list[Choices], np.ndarray]:
     """Return all choices, those of a kind together, and ``offsets`` (rows, thresholds)."""
-    found, rows = [], [np.zeros((1, thresholds.count))]
+    found, rows = [], [np.zeros((1, thresholds.total))]
     sizes, grades = answers.sizes, answers.grades
     for size, marks in np.unique(np.stack([sizes, grades], axis=1), axis=0):
         which = np.flatnonzero((sizes == size) & (grades == marks))
@@ -103,7 +103,7 @@ def choices_of(answers: Answers, thresholds: Thresholds) -> tuple[list[Choices],
         kinds = np.zeros(marks, dtype=int)
         if used is not None:
             kinds = sum(map(len, rows)) + np.arange(marks)
-            rows.append(np.zeros((marks, thresholds.count)))
+            rows.append(np.zeros((marks, thresholds.total)))
             rows[-1][:, used] = offsets
         shape = (len(which), marks)
         found.append(
@@ -205,7 +205,7 @@ def gaps(
     for part in found:
         K = part.chosen.shape[1]
         sets.setdefault(1 << (K - 2).bit_length(), []).append(part)
-    rows = len(pool) + thresholds.count
+    rows = len(pool) + thresholds.total
     pairs = np.zeros((rows, padded(1))), np.zeros(padded(1)), np.zeros(padded(1))
     wide = []
     for width, parts in sorted(sets.items()):

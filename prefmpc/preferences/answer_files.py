@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from prefmpc._checks import finite_array, flag, is_whole, number
+from prefmpc._checks import finite_array, flag, is_whole, number, positive_int
 from prefmpc._files import atomic_write
 from prefmpc.preferences.codings import NOBODY, RANKING, filled
 from prefmpc.preferences.logs import FIELDS, at_line
@@ -62,9 +62,8 @@ def read_lines(path: str | os.PathLike[str]) -> tuple[Any, ...] | None:
     with at_line(path, 1):
         if head[HEAD] != FORMAT or isinstance(head[HEAD], bool):
             raise ValueError(f"{HEAD} must be format {FORMAT}, got {head[HEAD]!r}")
-        per_step, count = flag("per_step", head.get("per_step")), head.get("trajectories")
-        if not is_whole(count) or count < 1:
-            raise ValueError(f"trajectories must be a whole number of at least 1, got {count!r}")
+        per_step = flag("per_step", head.get("per_step"))
+        count = positive_int("trajectories", head.get("trajectories"))
     pool: list[Trajectory] = []
     rows: list[list[int]] = []
     values: list[tuple[int, float]] = []

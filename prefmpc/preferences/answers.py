@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, indices, positive_int, sequence
+from prefmpc._checks import finite_array, indices, instance, positive_int, sequence
 from prefmpc._pytree import register_pytree, set_fields
 from prefmpc.preferences.answer_files import read_lines, write_lines
 from prefmpc.preferences.codings import (
@@ -97,10 +97,11 @@ class Answers:
 
     def subset(self, index: ArrayLike) -> Answers:
         """Return the answers chosen by an integer or boolean index, in that order."""
+        which = indices("index", index)
         try:
-            chosen = np.arange(len(self))[indices("index", index)]
+            chosen = np.arange(len(self))[which]
         except IndexError:
-            chosen = np.zeros(0)
+            chosen = np.zeros(0, dtype=int)
         if chosen.ndim != 1 or not chosen.size:
             raise ValueError(f"index must choose among the {len(self)} answers, got {index}")
         parts = self.shown[chosen], self.grades[chosen], self.answers[chosen]
@@ -130,9 +131,7 @@ class Answers:
     @classmethod
     def from_comparisons(cls, comparisons: Comparisons) -> Answers:
         """Return compared pairs as answers on a scale of 2: the same likelihood."""
-        if not isinstance(comparisons, Comparisons):
-            got = type(comparisons).__name__
-            raise ValueError(f"comparisons must be Comparisons, got {got}")
+        instance("comparisons", comparisons, Comparisons)
         shown = np.stack([comparisons.first, comparisons.second], axis=1)
         grades = np.full(len(comparisons), 2)
         return cls(comparisons.trajectories, shown, grades, comparisons.labels)
@@ -173,8 +172,8 @@ class Answers:
                 f"first and second must have shape ({len(entries)},), one a label, "
                 f"got {sides[0].shape} and {sides[1].shape}"
             )
-        values = [grade_of(i, label, coding, marks) for i, label in enumerate(entries)]
-        return cls(trajectories, np.stack(sides, axis=1), np.full(len(values), marks), values)
+        values = np.array([grade_of(i, label, coding, marks) for i, label in enumerate(entries)])
+        return cls(trajectories, np.stack(sides, axis=1), np.full(values.size, marks), values)
 
     @classmethod
     def from_ratings(
@@ -330,6 +329,6 @@ def as_answers(name: str, value: Any) -> Answers:
 
 
 def check_data(name: str, value: Any) -> None:
-    """Raise a ValueError unless ``value`` is a data set to learn from."""
-    if not isinstance(value, Comparisons | Answers):
-        raise ValueError(f"{name} must be Comparisons or Answers, got {type(value).__name__}")
+    """Raise a ValueError unless ``value`` is a data set to learn from: of either kind."""
+    if not isinstance(value, Answers):
+        instance(name, value, Comparisons)

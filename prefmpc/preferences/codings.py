@@ -53,7 +53,7 @@ def check_answers(shown: np.ndarray, grades: np.ndarray, answers: np.ndarray, co
     _refuse("shown", ranked & twice, "hold no trajectory twice in a ranking", shown)
 
 
-def _refuse(name: str, bad: np.ndarray, wish: str, values: np.ndarray) -> None:
+def _refuse(name: str, bad: Any, wish: str, values: np.ndarray) -> None:
     if bad.any():
         i = int(np.argmax(bad))
         raise ValueError(f"{name} must {wish}, got {values[i].tolist()} at index {i}")

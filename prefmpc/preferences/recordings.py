@@ -154,5 +154,8 @@ def joined(pools: Sequence[Trajectory | Recordings]) -> Trajectory | Recordings:
         for i, pool in enumerate(plain):
             _alike(i, pool, plain[0])
         return jax.tree.map(lambda *leaves: np.concatenate(leaves), *plain)
-    each = [[pool] if isinstance(pool, Trajectory) else list(pool) for pool in pools]
+    each = [
+        [pool] if isinstance(pool, Trajectory) else [pool[i] for i in range(len(pool))]
+        for pool in pools
+    ]
     return Recordings([one for pool in each for one in pool], per_step=flags.pop())
