@@ -6,7 +6,7 @@ results that the book reads. NAME is "quadratic" and "distinct" (case study 1), 
 prior is worth), "onesided" (a person whom no quadratic represents), "references" (many set
 points), "signals" (what σ may see), "lane" (a car and its passenger), "stability",
 "asking" and "fewer" (strategies that choose the next question), "stopping", "limits" or "settled"
-(when to stop asking, and when choosing fails).
+(when to stop asking, and when choosing fails), "people" (several, and such as change).
 """
 
 from studies.measures import baselines, measures_case
