@@ -5,7 +5,7 @@ from __future__ import annotations
 import cvxpy as cp
 import numpy as np
 
-from prefmpc import Answers, Comparisons, Recordings, Trajectory
+from prefmpc import Answers, Recordings, Trajectory
 
 
 def pool_of(rng, count=8, nx=2, nu=1):

@@ -8,6 +8,8 @@ points), "signals" (what σ may see), "lane" (a car and its passenger), "stabili
 "answers" (ties, strengths and rankings beside pairs), "asking" and "fewer" (strategies that choose
 the next question), "stopping", "limits" or "settled" (when to stop asking, and when choosing
 fails).
+"asking" and "fewer" (strategies that choose the next question), "stopping", "limits" or "settled"
+(when to stop asking, and when choosing fails), "people" (several, and such as change).
 """
 
 from studies.measures import baselines, measures_case

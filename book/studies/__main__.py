@@ -18,6 +18,7 @@ from studies import (
     lane,
     measures,
     onesided,
+    people,
     priors,
     quadratic,
     references,
@@ -137,6 +138,16 @@ STUDIES: dict[str, Study] = {
         {
             **{"variants": settling.SETTLING_VARIANTS, "ways": asking_limits.WAYS},
             **{"counts": asking_limits.SETTLED_COUNTS, "columns": asking_limits.SETTLED_COLUMNS},
+        },
+    ),
+    "people": (
+        people.people_case,
+        "extensions/people_spread.json",
+        {
+            **{"rated": people.RATED, "few": people.FEW, "pooled": people.POOLED},
+            **{"camps": people.CAMPS, "camp columns": people.CAMP_COLUMNS},
+            **{"methods": people.METHODS, "calibrated": people.CALIBRATED},
+            **{"changes": people.CHANGES, "remembered": people.REMEMBERED},
         },
     ),
     "references": (

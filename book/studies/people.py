@@ -16,6 +16,7 @@ from prefmpc._random import generator
 from prefmpc.learning.camps import find_camps
 from prefmpc.learning.change import forgetting, has_changed
 from prefmpc.learning.people import fit_hierarchy, fit_raters
+from prefmpc.learning.people_posterior import people_posterior
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.preferences.comparisons import Comparisons
 from prefmpc.preferences.pools import lqr_pool, random_states
@@ -45,12 +46,13 @@ CAMP_PEOPLE, CAMP_EACH = 10, 20
 CAMP_COLUMNS = ("camps", "rightly assigned")
 
 CALIBRATED = ("sharpness of one", "weights of the common σ", "lapse rate of one")
+METHODS = ("Laplace", "samples")
 REPEATS = 5
 """Populations of a draw that are drawn from the prior."""
 
 CHANGES = ("nothing changes", "weights change halfway")
 REMEMBERED = ("all alike", "forgetting", "late half only")
-LONG, HALF_LIFE, SIMULATIONS = 80, 20.0, 39
+LONG, HALF_LIFE, SIMULATIONS = 80, 20.0, 19
 
 
 class Someone:
@@ -120,7 +122,7 @@ def raters(pool: Trajectory, rng: np.random.Generator) -> tuple[Someone, list[Qu
     person = Someone(rng.standard_normal(8), pool)
     everybody = [person] * RELIABLE + [None] * (RATERS - RELIABLE)
     data = together(pool, everybody, EACH, rng)
-    some = data.subset(data.who < RELIABLE)
+    some = data.subset(np.arange(RELIABLE * EACH))
     return person, [
         fit_raters(alone(data), rule(), lapse=0.0).model,
         fit_raters(data, rule()).model,
@@ -180,10 +182,10 @@ def camps(pool: Trajectory, rng: np.random.Generator) -> np.ndarray:
 
 
 def calibration(pool: Trajectory, rng: np.random.Generator) -> np.ndarray:
-    """Return the coverage of 90 % intervals (repeats, `CALIBRATED`) for people of the prior."""
+    """Return the coverage (`REPEATS`, `METHODS`, `CALIBRATED`) of 90 % intervals."""
     sizes = {"spread": 1.0, "sharpness": 1.0, "sharper": 1.0}
     mode = np.concatenate([np.diag(rule().Q), np.diag(rule().R)])
-    out = np.zeros((REPEATS, len(CALIBRATED)))
+    out = np.zeros((REPEATS, len(METHODS), len(CALIBRATED)))
     for i in range(REPEATS):
         logs = rng.standard_normal(8)
         sharpness = np.exp(rng.standard_normal() + rng.standard_normal(RATERS))
@@ -197,12 +199,15 @@ def calibration(pool: Trajectory, rng: np.random.Generator) -> np.ndarray:
         P = rates[who] / 2 + (1 - rates[who]) * 0.5 * (1 + np.tanh(z / 2))
         data = Comparisons(pool, first, second, (rng.uniform(size=P.size) < P).astype(float), who)
         found = fit_raters(data, rule(), **sizes)
-        intervals = found.sharpness(), found.relative(), found.lapses()
+        drawn = people_posterior(found, draws=512, key=int(rng.integers(2**31)))
         truths = sharpness[:1], w, rates[:1]
-        out[i] = [
-            np.mean((low[: t.size] <= t) & (t <= high[: t.size]))
-            for (_, low, high), t in zip(intervals, truths, strict=True)
+        intervals = [
+            (found.sharpness(), found.relative(), found.lapses()),
+            [drawn.interval(part) for part in (drawn.sharpness, drawn.relative, drawn.lapse)],
         ]
+        for j, k in np.ndindex(out.shape[1:]):
+            (_, low, high), t = intervals[j][k], truths[k]
+            out[i, j, k] = np.mean((low[: t.size] <= t) & (t <= high[: t.size]))
     return out
 
 
@@ -237,7 +242,8 @@ def people_case(*, key: Any, loops: int = 50) -> dict[str, np.ndarray]:
     dict
         Regrets "rated" (`RATED`), "pooled" (newcomers, `FEW`, `POOLED`) and "remembered"
         (`CHANGES`, `REMEMBERED`); "apart", as estimated from the crowd; "camps" (`CAMPS`,
-        `CAMP_COLUMNS`); "covered" (repeats, `CALIBRATED`) of intervals of 90 %; "p_value"
+        `CAMP_COLUMNS`); "covered" (repeats, `METHODS`,
+        `CALIBRATED`) by intervals of 90 %; "p_value"
         (`CHANGES`).
     """
     streams = generator(key).spawn(6)

@@ -14,6 +14,7 @@ from prefmpc.learning.convex import Interval, MapResult, fit_map, fit_maps
 from prefmpc.learning.early_stopping import NetworkFit, fit_network
 from prefmpc.learning.global_fit import GlobalResult, fit_global
 from prefmpc.learning.people import PeopleResult, fit_hierarchy, fit_raters
+from prefmpc.learning.people_posterior import PeoplePosterior, people_posterior
 from prefmpc.learning.priors import WishartPrior, blocks, bryson
 from prefmpc.learning.selection import PriorChoice, choose_prior
 from prefmpc.learning.training import FitResult, fit
@@ -29,6 +30,7 @@ __all__ = [
     "Interval",
     "MapResult",
     "NetworkFit",
+    "PeoplePosterior",
     "PeopleResult",
     "Posterior",
     "PriorChoice",
@@ -48,5 +50,6 @@ __all__ = [
     "fit_raters",
     "forgetting",
     "has_changed",
+    "people_posterior",
     "posterior",
 ]

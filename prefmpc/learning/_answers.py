@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -54,7 +55,7 @@ class Answers:
         gap = np.ascontiguousarray(problem.gap.T[order])
         return cls(gap, comparisons.labels[order], weights[order], start, names, mode, problem.nu)
 
-    @property
+    @cached_property
     def person(self) -> np.ndarray:
         """Whose each answer is (n,)."""
         counts = np.diff(np.append(self.start, len(self.labels)))

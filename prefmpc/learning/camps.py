@@ -23,6 +23,9 @@ from prefmpc.preferences.comparisons import Comparisons
 ROUNDS = 60
 """At most so many of expectation and maximisation from each start."""
 
+STEPS = 10
+"""Newton steps of a round at most: the next one starts where it ended."""
+
 SETTLED = 1e-3
 """A search has ended when no probability of belonging to a camp moves further in a round."""
 
@@ -41,7 +44,7 @@ class Camps(Result):
         Of belonging to each.
     Q, R : array (count, nx, nx), (count, nu, nu)
         What each camp wants.
-    log_evidence : array (most,)
+    log_evidence : array (tried,)
         log P(answers) with 1, 2, … camps, in nats, by Laplace's method.
     status : "converged" or "max_iterations"
         "converged": where the best start with the chosen number ended, no probability moved any
@@ -107,7 +110,7 @@ def find_camps(
     *,
     most: int = 3,
     odds: float = 20.0,
-    starts: int = 10,
+    starts: int = 5,
     key: Any = 0,
     apart: float = 0.0,
     spread: float = 2.0,
@@ -120,9 +123,9 @@ def find_camps(
 
     A mixture: each person belongs to one of K camps and has a sharpness and a lapse rate of their
     own, as in `fit_raters`. Expectation and maximisation from several starts, each of them at
-    what K people want who were drawn at random. K is the smallest number that no larger one beats
-    by ``odds`` in the evidence. Warns where there is more than one camp: one σ for all would be a
-    compromise that perhaps nobody wants.
+    what K people want who were drawn at random. K grows as long as one more camp makes the
+    answers ``odds`` times as probable. Warns where there is more than one camp: one σ for all
+    would be a compromise that perhaps nobody wants.
 
     Parameters
     ----------
@@ -156,14 +159,14 @@ def find_camps(
     most, starts = positive_int("most", most), positive_int("starts", starts)
     odds = number("odds", odds, holds=lambda v: 1 <= v < np.inf, wish="be at least 1 and finite")
     rng = generator(key)
-    found = []
+    found: list[_Mixture] = []
     for count in range(1, min(most, len(answers.start)) + 1):
         tries = [_search(answers, form, count, rng) for _ in range(starts if count > 1 else 1)]
         found.append(max(tries, key=lambda t: (t.certified, t.log_evidence)))
+        if count > 1 and found[-1].log_evidence - found[-2].log_evidence <= np.log(odds):
+            break
     evidence = np.array([mixture.log_evidence for mixture in found])
-    chosen = next(
-        k for k in range(len(found)) if (evidence[k:] - evidence[k]).max() <= np.log(odds)
-    )
+    chosen = int(np.sum(np.diff(evidence) > np.log(odds)))
     out = _result(answers, form, found[chosen], evidence)
     warn_of_failure(out)
     if out.count > 1:
@@ -194,7 +197,8 @@ def _search(answers: Answers, form: Form, count: int, rng: np.random.Generator) 
         rounds += 1
         for k, mode in enumerate(modes):
             start = None if mode is None else (mode.u, mode.x)
-            modes[k] = minimise(answers, form, start=start, counts=probability[:, k])
+            limit = 100 if mode is None else STEPS
+            modes[k] = minimise(answers, form, start=start, counts=probability[:, k], limit=limit)
         if count == 1:
             return _Mixture(modes, probability, modes[0].log_evidence, 0.0, rounds)
         alone = [_given(answers, form, mode.u, mode.x) for mode in modes]
