@@ -226,6 +226,45 @@ def test_a_saved_file_has_ordinary_permissions(tmp_path, some):
     assert path.stat().st_mode == plain.stat().st_mode
 
 
+@pytest.mark.parametrize("who", [["Ada", "Grace", "Ada"], [7, 3, 7], np.array(["a", "b", "c"])])
+def test_who_answered_stays_with_the_answers(tmp_path, who):
+    named = Comparisons(POOL, [0, 1, 2], [3, 4, 5], [1, 0, 0.3], who)
+    assert named.subset([2, 1]).who.tolist() == [who[2], who[1]]
+    assert named.sampled(key=KEY).who.tolist() == list(who)
+    path = named.save(tmp_path / "data.npz")
+    loaded = Comparisons.load(path)
+    assert_same(loaded, named)
+    assert loaded.who.dtype == named.who.dtype
+    assert loaded.who.tolist() == list(who)
+    with np.load(path) as file:
+        assert file["format_version"] == 3
+
+
+def test_a_file_without_names_is_of_the_version_that_older_readers_know(tmp_path, some):
+    assert some.who is None
+    assert some.subset([0]).who is None
+    with np.load(some.save(tmp_path / "data.npz")) as file:
+        assert file["format_version"] == 1
+        assert "who" not in file
+
+
+def test_own_recordings_may_say_who_answered():
+    assert Comparisons.from_arrays(X, U, X, U, [1, 0], who=["Ada", "Bob"]).who.tolist() == [
+        "Ada",
+        "Bob",
+    ]
+
+
+@pytest.mark.parametrize("twins", [["Ada", "ada"], ["Ada L.", "Ada  L."], [" Bob", "Bob"]])
+def test_one_person_under_two_names_is_asked_about(twins):
+    with pytest.warns(UserWarning, match=r"blanks or in case") as warned:
+        Comparisons(POOL, [0, 1, 2], [3, 4, 5], [1, 0, 1], [*twins, "Eve"])
+    (said,) = {str(w.message) for w in warned}
+    assert all(repr(name) in said for name in twins)
+    assert "Eve" not in said
+    assert warned[0].filename == __file__
+
+
 def stored(some, **changes):
     names = ["x", "u", "y", "first", "second", "labels"]
     arrays = dict(zip(names, contents(some), strict=True), format_version=np.asarray(1))
@@ -235,9 +274,9 @@ def stored(some, **changes):
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"format_version": np.asarray(3)}, r"format version \(1, 2\), got 3"),
-        ({"format_version": np.asarray([1, 1])}, r"format version \(1, 2\)"),
-        ({"format_version": np.asarray("one")}, r"format version \(1, 2\)"),
+        ({"format_version": np.asarray(4)}, r"format version \(1, 2, 3\), got 4"),
+        ({"format_version": np.asarray([1, 1])}, r"format version \(1, 2, 3\)"),
+        ({"format_version": np.asarray("one")}, r"format version \(1, 2, 3\)"),
         ({"labels": None, "x": None}, r"lacks \['labels', 'x'\]"),
         ({"format_version": None}, "lacks"),
         ({"labels": np.array([1, 0, 2.0])}, r"labels must lie in \[0, 1\]"),
@@ -308,6 +347,13 @@ def no_answer(first, second):
         (lambda: Comparisons(POOL, [0], [1], [-1]), r"labels must lie in \[0, 1\]"),
         (lambda: Comparisons(POOL, [0], [1], [np.nan]), "labels must be finite"),
         (lambda: Comparisons(POOL, [0], [1], [[1]]), "labels must have 1 dimension"),
+        (lambda: Comparisons(POOL, [0], [1], [1], []), "who must name 1 people, .* got 0"),
+        (lambda: Comparisons(POOL, [0], [1], [1], "Ada"), "who must be a sequence, got str"),
+        (lambda: Comparisons(POOL, [0], [1], [1], [None]), "who must hold whole .* got None"),
+        (lambda: Comparisons(POOL, [0], [1], [1], [" "]), "who must hold .* not blank, got ' '"),
+        (lambda: Comparisons(POOL, [0], [1], [1], [0.5]), "who must hold whole .* got 0.5"),
+        (lambda: Comparisons(POOL, [0, 1], [1, 2], [1, 1], [1, "Ada"]), "who must hold .* both"),
+        (lambda: Comparisons(POOL, [0], [1], [1], [2**70]), "who must hold whole .* 64 bits"),
         (lambda: Comparisons(POOL, [0, 1], [1], [1]), "first must hold 1 whole numbers"),
         (lambda: Comparisons(POOL, [0], [1.5], [1]), "second must hold whole numbers, got float"),
         (lambda: Comparisons(POOL, [0], [6], [1]), r"second must point.*0 to 5\), got 6 to 6"),

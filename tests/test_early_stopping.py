@@ -19,7 +19,7 @@ from prefmpc import (
     oscillating_masses,
 )
 from prefmpc.learning import early_stopping
-from prefmpc.learning.early_stopping import _batches, _part
+from prefmpc.learning.early_stopping import _batches
 from prefmpc.learning.losses import cross_entropy, padded_size, pair_data
 from studies import RADIUS
 
@@ -194,8 +194,8 @@ def test_an_epoch_takes_each_pair_once_whatever_the_sizes(n, size):
 
 def test_a_part_of_a_batch_that_is_free_counts_for_nothing():
     data = jax.device_put(pair_data(STARTS, NOISY, 1024))
-    part = _part(data, np.array([3, 7, 1024, 1024]))
-    alone = _part(data, np.array([3, 7]))
+    part = data.part(np.array([3, 7, 1024, 1024]))
+    alone = data.part(np.array([3, 7]))
     assert float(cross_entropy(STARTS[0], part)) == pytest.approx(
         float(cross_entropy(STARTS[0], alone)), rel=1e-12
     )

@@ -12,11 +12,13 @@ import jax
 import numpy as np
 
 from studies import (
+    answers,
     asking,
     asking_limits,
     lane,
     measures,
     onesided,
+    people,
     priors,
     quadratic,
     references,
@@ -91,6 +93,11 @@ STUDIES: dict[str, Study] = {
             "controllers": onesided.CONTROLLERS,
         },
     ),
+    "answers": (
+        answers.answers_case,
+        "extensions/answers_spread.json",
+        {"people": answers.PEOPLE, "learners": answers.LEARNERS, "counts": answers.COUNTS},
+    ),
     "asking": (
         asking.asking_case,
         "extensions/asking_spread.json",
@@ -131,6 +138,16 @@ STUDIES: dict[str, Study] = {
         {
             **{"variants": settling.SETTLING_VARIANTS, "ways": asking_limits.WAYS},
             **{"counts": asking_limits.SETTLED_COUNTS, "columns": asking_limits.SETTLED_COLUMNS},
+        },
+    ),
+    "people": (
+        people.people_case,
+        "extensions/people_spread.json",
+        {
+            **{"rated": people.RATED, "few": people.FEW, "pooled": people.POOLED},
+            **{"camps": people.CAMPS, "camp columns": people.CAMP_COLUMNS},
+            **{"methods": people.METHODS, "calibrated": people.CALIBRATED},
+            **{"changes": people.CHANGES, "remembered": people.REMEMBERED},
         },
     ),
     "references": (

@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 
 from prefmpc._checks import to_numpy
 from prefmpc._sharding import WHOLE, on_mesh, shares
-from prefmpc.learning._problem import Entries, Problem, data_derivatives, identity, loss
+from prefmpc.learning._problem import Data, Entries, Problem, identity
 
 TO_BOUNDARY = 0.95
 """No step goes further towards a singular matrix than this share of the way."""
@@ -87,11 +87,20 @@ class Minimum(NamedTuple):
     log_likelihood: Any
     decrement: Any
     hessian: Any
+    """Of weights, then thresholds."""
     steps: Any
+    thresholds: Any = ()
+
+    @property
+    def covariance(self) -> Any:
+        """Laplace's covariance (p, p) of the weights."""
+        p = self.w.size
+        return np.linalg.inv(self.hessian)[:p, :p]
 
     def converged(self, tol: float) -> bool:
         """Whether the decrement certifies the minimum; the last step may have moved the value."""
-        numbers = [np.isfinite(part).all() for part in (self.w, self.objective, self.decrement)]
+        found = self.w, self.objective, self.decrement, self.thresholds
+        numbers = [np.isfinite(part).all() for part in found]
         # Nothing is small beside an infinite objective.
         return all(numbers) and bool(self.decrement <= 1.01 * tol * (1 + abs(self.objective)))
 
@@ -105,6 +114,7 @@ class _Prior(NamedTuple):
 
 class _Iterate(NamedTuple):
     w: Any
+    """Weights (p,), then thresholds."""
     z: Any
     dual: Any
     """Z (d, d): strength·W⁻¹ in the end."""
@@ -119,33 +129,42 @@ class _Iterate(NamedTuple):
 class _Path(NamedTuple):
     """What stays the same during the iteration, and the steps of it."""
 
-    gap: Any
-    labels: Any
-    weights: Any
+    data: Data
     entries: Entries
     mode: Any
     precision: Any
     """(p,): the derivative of tr(mode⁻¹W)."""
     goal: _Prior
+    spread: Any
+    """Of the thresholds' prior."""
     tol: Any
     total: Callable[[Any], Any]
     """Adds up what is a sum over comparisons, where these are shared among devices."""
 
+    def matrix(self, w: Any) -> Any:
+        """Return W (d, d) of weights and thresholds."""
+        return self.entries.matrix(w[: self.precision.size])
+
     def objective(self, w: Any, z: Any, prior: _Prior) -> Any:
         """Return −log posterior, NaN outside of the cone, where Cholesky fails."""
-        log_det = 2 * jnp.sum(jnp.log(jnp.diag(factor(self.entries.matrix(w)))))
-        distance = prior.tightness * (self.precision @ w) - log_det
-        return self.total(loss(z, self.labels, self.weights)) + prior.strength * distance
+        p = self.precision.size
+        log_det = 2 * jnp.sum(jnp.log(jnp.diag(factor(self.matrix(w)))))
+        distance = prior.tightness * (self.precision @ w[:p]) - log_det
+        value = self.total(self.data.loss(z)) + prior.strength * distance
+        return value if w.size == p else value + jnp.sum((w[p:] / self.spread) ** 2) / 2
 
     def begin(self) -> _Iterate:
         """Start at the mode of a prior so tight and strong that it is nearly the minimum."""
         entries, total = self.entries, self.total
         w = self.mode[entries.rows, entries.columns]
-        z = w @ self.gap
-        size = jnp.sqrt(total(self.weights @ z**2) / jnp.maximum(total(jnp.sum(self.weights)), 1.0))
+        p, more = w.size, len(self.data.gap) - w.size
+        w = jnp.concatenate([w, jnp.zeros(more)]) if more else w
+        z = self.data.logits(w)
+        size = jnp.sqrt(self.data.mean_square(z, total))
         tightness = jnp.maximum(1.0, size / LOG_ODDS)
-        w, z, W_inverse = w / tightness, z / tightness, inverse(self.mode) * tightness
-        gradient = total(self.gap @ (self.weights * (jax.nn.sigmoid(z) - self.labels)))
+        w, W_inverse = w / tightness, inverse(self.mode) * tightness
+        z = jax.tree.map(lambda part: part / tightness, z)
+        gradient = total(self.data.gradient(z))[:p]
         count = jnp.where(entries.rows == entries.columns, 1.0, 2.0)
         pull = self.mode @ entries.matrix(gradient / count) / tightness
         strength = jnp.maximum(self.goal.strength, jnp.sqrt(jnp.abs(jnp.sum(pull * pull.T))))
@@ -162,29 +181,31 @@ class _Path(NamedTuple):
         """Take a step in w and Z, and go on to the next prior of the path where w is near."""
         prior = at.prior
         arrived = (prior.strength <= self.goal.strength) & (prior.tightness <= self.goal.tightness)
-        W_inverse = inverse(self.entries.matrix(at.w))
-        gradient, data_hessian = data_derivatives(
-            self.gap, at.z, self.labels, self.weights, self.total
-        )
-        gradient += prior.strength * (
+        W_inverse = inverse(self.matrix(at.w))
+        gradient, data_hessian = self.data.derivatives(at.z, self.total)
+        pull = prior.strength * (
             prior.tightness * self.precision - self.entries.gradient(W_inverse)
         )
         # Near the end Z = strength·W⁻¹ up to rounding; then the exact Hessian is as good.
         exact = arrived & (at.decrement <= ALMOST * (1 + jnp.abs(at.objective)))
         partner = jnp.where(exact, prior.strength * W_inverse, at.dual)
-        hessian = data_hessian + product_hessian(W_inverse, partner, self.entries)
+        bend = product_hessian(W_inverse, partner, self.entries)
+        if more := at.w.size - pull.size:
+            pull = jnp.concatenate([pull, at.w[pull.size :] / self.spread**2])
+            bend = jax.scipy.linalg.block_diag(bend, jnp.eye(more) / self.spread**2)
+        gradient, hessian = gradient + pull, data_hessian + bend
         step, decrement = newton_step(hessian, gradient)
 
         now = self.objective(at.w, at.z, prior)
-        dz = step @ self.gap
+        dz = self.data.logits(step)
         t, value = self.line_search(at, step, dz, now, decrement)
-        dual, t = self.moved_dual(at, W_inverse, self.entries.matrix(step), t)
+        dual, t = self.moved_dual(at, W_inverse, self.matrix(step), t)
         final = arrived & self.small(decrement, now)
         stuck = ~(final & exact) & ~(t > 1e-12)
         t = jnp.where(stuck, 0.0, t)  # a certified point still takes the step that it has paid for
         return _Iterate(
             at.w + t * step,
-            at.z + t * dz,
+            jax.tree.map(lambda a, b: a + t * b, at.z, dz),
             dual,
             self.next_prior(prior, decrement),
             jnp.where(t > 0, value, now),
@@ -199,11 +220,12 @@ class _Path(NamedTuple):
         self, at: _Iterate, step: Any, dz: Any, now: Any, decrement: Any
     ) -> tuple[Any, Any]:
         """Return the length of the step and the objective there."""
-        W, dW = self.entries.matrix(at.w), self.entries.matrix(step)
+        W, dW = self.matrix(at.w), self.matrix(step)
 
         def value(t: Any) -> Any:
             room = factor(W + t / TO_BOUNDARY * dW)[-1, -1]  # NaN if the boundary is too near
-            trial = self.objective(at.w + t * step, at.z + t * dz, at.prior)
+            z = jax.tree.map(lambda a, b: a + t * b, at.z, dz)
+            trial = self.objective(at.w + t * step, z, at.prior)
             return jnp.where(jnp.isnan(room), jnp.nan, trial)
 
         slack = 1e-13 * (1 + jnp.abs(now))
@@ -232,12 +254,11 @@ class _Path(NamedTuple):
 
 
 def newton(
-    gap: Any,
-    labels: Any,
-    weights: Any,
+    data: Data,
     entries: Entries,
     mode: Any,
     strength: Any,
+    spread: Any,
     tol: Any,
     limit: Any,
     total: Callable[[Any], Any] = identity,
@@ -256,27 +277,31 @@ def newton(
     each other forever in a small thread pool.
     """
     precision, goal = entries.gradient(inverse(mode)), _Prior(strength, 1.0)
-    path = _Path(gap, labels, weights, entries, mode, precision, goal, tol, total)
+    path = _Path(data, entries, mode, precision, goal, spread, tol, total)
 
     def unfinished(at: _Iterate) -> Any:
         return (at.steps < limit) & ~path.small(at.decrement, at.objective) & ~at.stuck
 
     end = jax.lax.while_loop(unfinished, path.move, path.begin())
     value = path.objective(end.w, end.z, goal)
-    log_likelihood = -total(loss(end.z, labels, weights))
-    return Minimum(end.w, value, log_likelihood, end.decrement, end.hessian, end.steps)
+    log_likelihood = -total(data.loss(end.z))
+    numbers = value, log_likelihood, end.decrement, end.hessian, end.steps
+    return Minimum(end.w[: precision.size], *numbers, end.w[precision.size :])
 
 
 _one = jax.jit(newton)
 _shared, _many = (
-    jax.jit(jax.vmap(newton, in_axes=(gap, 0, 0, None, 0, 0, None, None))) for gap in (None, 0)
+    jax.jit(jax.vmap(newton, in_axes=(Data(gap, 0, 0, ()), None, 0, 0, None, None, None)))
+    for gap in (None, 0)
 )
 
 
 @lru_cache(maxsize=8)
 def _over(axes: Any) -> Callable[..., Minimum]:
     """Return `newton` for comparisons shared along these axes of a mesh."""
-    return partial(newton, total=lambda value: jax.lax.psum(value, axes))
+
+    run = partial(newton, total=lambda value: jax.lax.psum(value, axes))
+    return lambda gap, labels, weights, *rest: run(Data(gap, labels, weights), *rest)
 
 
 def solve(
@@ -290,12 +315,13 @@ def solve(
     if mesh is not None or len(problems) == 1:
         found = []
         for p in problems:
-            arguments = p.gap, p.labels, p.weights, p.entries, p.mode, p.strength, tol, limit
+            rest = p.entries, p.mode, p.strength, p.spread, tol, limit
             if mesh is None:
-                found.append(to_numpy(_one(*arguments)))
+                found.append(to_numpy(_one(p.data, *rest)))
             else:
                 one = shares(mesh)
-                specs = (shares(mesh, axis=1), one, one, *[WHOLE] * 5)
+                specs = (shares(mesh, axis=1), one, one, *[WHOLE] * len(rest))
+                arguments = p.gap, p.labels, p.weights, *rest
                 found.append(on_mesh(_over(mesh.axis_names), mesh, specs, WHOLE, arguments))
         return found
     labels, weights, mode, strength = (
@@ -305,5 +331,5 @@ def solve(
     shared = all(p.gap is first.gap for p in problems)
     gap = first.gap if shared else np.stack([p.gap for p in problems])
     run = _shared if shared else _many
-    out = run(gap, labels, weights, first.entries, mode, strength, tol, limit)
+    out = run(Data(gap, labels, weights), first.entries, mode, strength, first.spread, tol, limit)
     return [Minimum(*parts) for parts in zip(*to_numpy(out), strict=True)]

@@ -10,10 +10,12 @@ import numpy as np
 import optax
 
 from prefmpc.models.quadratic import CostModel, QuadraticCost, check_model
+from prefmpc.preferences.answers import Answers
 from prefmpc.preferences.comparisons import Comparisons
+from prefmpc.preferences.recordings import batches
 
 
-def check_starts(comparisons: Comparisons, initial: Any) -> CostModel:
+def check_starts(comparisons: Comparisons | Answers, initial: Any) -> CostModel:
     """Return the starts, stacked along one leading axis, or raise a ValueError."""
     if isinstance(initial, QuadraticCost) and not initial.batch_shape:
         initial = jax.tree.map(lambda leaf: leaf[None], initial)
@@ -26,7 +28,8 @@ def check_starts(comparisons: Comparisons, initial: Any) -> CostModel:
         raise ValueError(f"initial must be stacked along one leading axis, got {sorted(sizes)}")
     one = jax.tree.map(lambda leaf: leaf[0], initial)
     try:
-        one(comparisons.trajectories)
+        for part in batches(comparisons.trajectories):
+            one(part)
     except ValueError as error:
         raise ValueError(f"initial must fit the comparisons: {error}") from None
     return initial

@@ -29,10 +29,11 @@ from prefmpc._checks import (
 from prefmpc._results import Result, warn_of_failure
 from prefmpc._sharding import check_mesh
 from prefmpc.learning._newton import Minimum, solve
-from prefmpc.learning._problem import Problem, build, check
+from prefmpc.learning._problem import Problem, answer_weights, build, build_answers, check
 from prefmpc.learning.losses import padded_size
 from prefmpc.learning.priors import Structure, WishartPrior
 from prefmpc.models.quadratic import QuadraticCost
+from prefmpc.preferences.answers import Answers, check_data
 from prefmpc.preferences.comparisons import Comparisons
 from prefmpc.preferences.trajectories import Trajectory
 
@@ -81,7 +82,7 @@ class MapResult(Result):
     decrement: float
     iterations: int
     seconds: float
-    comparisons: Comparisons = dataclasses.field(repr=False)
+    comparisons: Comparisons | Answers = dataclasses.field(repr=False)
     prior: WishartPrior = dataclasses.field(repr=False)
     structure: Structure = dataclasses.field(repr=False)
     outputs: np.ndarray | None = dataclasses.field(repr=False)
@@ -111,6 +112,12 @@ class MapResult(Result):
         return float(np.trace(np.linalg.solve(self.problem.mode, W))) / len(W)
 
     @property
+    def thresholds(self) -> dict[str, np.ndarray]:
+        """What was learned beside σ from `Answers`, in log-odds, by name; see `fit_map`."""
+        self.check()
+        return self.problem.thresholds.named(self.minimum.thresholds)
+
+    @property
     def normalised(self) -> QuadraticCost:
         """σ / `sharpness`: what is wanted, whatever the noise, so that people can be compared."""
         sharpness = self.sharpness
@@ -132,7 +139,7 @@ class MapResult(Result):
 
     def _std(self) -> tuple[np.ndarray, np.ndarray]:
         self.check()
-        covariance = np.linalg.inv(self.minimum.hessian)
+        covariance = self.minimum.covariance
         slopes = self.problem.costs(np.eye(self.minimum.w.size))  # ∂Q/∂w (p, nx, nx), ∂R/∂w
         Q, R = (np.sqrt(np.einsum("aij,ab,bij->ij", S, covariance, S)) for S in slopes)
         return Q, R
@@ -142,8 +149,7 @@ class MapResult(Result):
         instance("first", first, Trajectory)
         instance("second", second, Trajectory)
         shapes = [[np.shape(leaf) for leaf in jax.tree.leaves(side)] for side in (first, second)]
-        trained = self.comparisons.trajectories
-        channels = [side.shape[-1] for side in (trained.x, trained.u)]
+        channels = [len(self.Q), len(self.R)]
         if shapes[0] != shapes[1] or [first.x.shape[-1], first.u.shape[-1]] != channels:
             raise ValueError(
                 f"first and second must have equal shapes with {channels[0]} states and "
@@ -174,7 +180,7 @@ class MapResult(Result):
         reach = ndtri((1 + share("level", level)) / 2)
         gap = self.gaps(first, second)
         z = np.tensordot(self.minimum.w, gap, 1)
-        variance = (gap * np.tensordot(np.linalg.inv(self.minimum.hessian), gap, 1)).sum(axis=0)
+        variance = (gap * np.tensordot(self.minimum.covariance, gap, 1)).sum(axis=0)
         std = np.sqrt(variance)
         odds = (z / np.sqrt(1 + np.pi * variance / 8), z - reach * std, z + reach * std)
         return Interval(*(expit(part) for part in odds))
@@ -187,15 +193,18 @@ class MapResult(Result):
         """
         Q0, R0 = (np.diag(np.diag(mode)) for mode in (self.prior.Q, self.prior.R))
         prior = WishartPrior(Q0, R0, self.prior.strength)
-        return fit_map(self.comparisons, prior, structure="diagonal", outputs=self.outputs)
+        weights = self.problem.weights[: len(self.comparisons)]
+        data = self.comparisons, prior
+        return fit_map(*data, structure="diagonal", outputs=self.outputs, weights=weights)
 
 
 def fit_map(
-    comparisons: Comparisons,
+    comparisons: Comparisons | Answers,
     prior: WishartPrior,
     *,
     structure: Structure = "full",
     outputs: ArrayLike | None = None,
+    weights: ArrayLike | None = None,
     max_iterations: int = 100,
     tol: float = 1e-8,
     mesh: Mesh | None = None,
@@ -206,9 +215,16 @@ def fit_map(
     z_i = σ(second_i) − σ(first_i), eq. (4) of arXiv 2511.22502, over positive definite Q and R,
     by Newton's method with exact derivatives from the prior's mode.
 
+    Answers of other kinds are choices among alternatives whose utilities are linear in (Q, R) and
+    in a few thresholds, so that their −log likelihood is convex in all of them; these are learned
+    along, with a weak Gaussian prior. See `prefmpc.learning.choices` for each model, and
+    ``thresholds`` of the result: "tie" is Davidson's log ν, "acceptable" the σ at which yes and no
+    are equally probable, "5 stars" the same between neighbouring ones, "5 grades" what the inner
+    grades have more than the outermost, from outside to the middle.
+
     Parameters
     ----------
-    comparisons : Comparisons
+    comparisons : Comparisons or Answers
         Labels may be soft (0.5: cannot say); the noise of the answers is in the scale of Q and R.
     prior : WishartPrior
     structure : {"full", "diagonal"} or (mask of Q, mask of R)
@@ -217,11 +233,13 @@ def fit_map(
     outputs : array (ny, nx), optional
         C of y = C x: σ then sees outputs and inputs only. The prior weighs y, and the result is
         Q = CᵀQ_yC.
+    weights : array (n,), optional
+        As how many answers each one counts, at least 0; see `forgetting`. The problem stays convex.
     tol : float
         Stop when half the squared Newton decrement is below ``tol`` times 1 + abs(objective).
     mesh : jax.sharding.Mesh, optional
-        Devices to share the comparisons among; they may belong to several processes, which then
-        all make the same call.
+        Devices to share Comparisons among; they may belong to several processes, which then all
+        make the same call.
 
     Returns
     -------
@@ -232,10 +250,16 @@ def fit_map(
     ValueError
         If an argument is out of range, or prior and trajectories do not fit each other.
     """
-    instance("comparisons", comparisons, Comparisons)
+    check_data("comparisons", comparisons)
     instance("prior", prior, WishartPrior)
+    if mesh is not None and isinstance(comparisons, Answers):
+        raise ValueError("mesh must be None for Answers: it shares Comparisons only")
+    if weights is not None and isinstance(comparisons, Answers):
+        raise ValueError("weights must be None for Answers: those of Comparisons count as many")
     mesh = None if mesh is None else check_mesh(mesh)
-    result = _solved([comparisons], [prior], structure, outputs, max_iterations, tol, mesh)[0]
+    counts = answer_weights(weights, len(comparisons))
+    options = structure, outputs, max_iterations, tol, mesh, counts
+    result = _solved([comparisons], [prior], *options)[0]
     warn_of_failure(result)
     return result
 
@@ -291,13 +315,14 @@ def _paired(
 
 
 def _solved(
-    data_sets: list[Comparisons],
+    data_sets: Sequence[Any],
     priors: list[WishartPrior],
     structure: Structure,
     outputs: ArrayLike | None,
     max_iterations: int,
     tol: float,
     mesh: Mesh | None = None,
+    weights: np.ndarray | None = None,
 ) -> list[MapResult]:
     require_x64()
     began = time.perf_counter()
@@ -305,8 +330,10 @@ def _solved(
     C, entries = check(data_sets, priors, structure, outputs)
     parts = 1 if mesh is None else mesh.size
     size = parts * padded_size(max(-(-len(data) // parts) for data in data_sets))
-    if all(data is data_sets[0] for data in data_sets):
-        problems = build(data_sets[0], priors, entries, C, size)
+    if isinstance(data_sets[0], Answers):
+        problems = [build_answers(data_sets[0], priors[0], entries, C)]
+    elif all(data is data_sets[0] for data in data_sets):
+        problems = build(data_sets[0], priors, entries, C, size, weights)
     else:
         pairs = zip(data_sets, priors, strict=True)
         problems = [build(data, [prior], entries, C, size)[0] for data, prior in pairs]

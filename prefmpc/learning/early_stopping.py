@@ -7,10 +7,9 @@ import time
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from prefmpc._checks import flag, instance, nonnegative, positive_int, require_x64, share, to_numpy
+from prefmpc._checks import flag, nonnegative, positive_int, require_x64, share, to_numpy
 from prefmpc._random import generator
 from prefmpc._results import FitError, Restarts, warn_of_failure
 from prefmpc.learning._starts import (
@@ -20,14 +19,10 @@ from prefmpc.learning._starts import (
     finite_models,
     held_out_count,
 )
-from prefmpc.learning.losses import (
-    PairData,
-    cross_entropy,
-    objective,
-    padded_size,
-    pair_data,
-)
+from prefmpc.learning.answer_losses import Task
+from prefmpc.learning.losses import cross_entropy, objective
 from prefmpc.models.quadratic import CostModel
+from prefmpc.preferences.answers import Answers, check_data
 from prefmpc.preferences.comparisons import Comparisons
 
 CHECK_EVERY = 10
@@ -54,6 +49,8 @@ class NetworkFit(Restarts):
         was still falling; "not_finite": a loss or a weight left the numbers, and the restart is
         not chosen.
     seconds : float
+    thresholds : dict of arrays (restarts, ...)
+        What was learned beside σ from `Answers`, by name: see `fit_map`. Empty for plain pairs.
     """
 
     NAME = "fit_network"
@@ -66,6 +63,7 @@ class NetworkFit(Restarts):
     best: np.ndarray
     status: np.ndarray
     seconds: float
+    thresholds: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     @property
     def message(self) -> str:
@@ -85,11 +83,11 @@ class NetworkFit(Restarts):
 
 
 def fit_network(
-    comparisons: Comparisons,
+    comparisons: Comparisons | Answers,
     initial: CostModel,
     *,
     key: Any,
-    validation: Comparisons | None = None,
+    validation: Comparisons | Answers | None = None,
     validation_fraction: float = 0.2,
     l2: float = 1e-4,
     learning_rate: float = 0.01,
@@ -106,12 +104,13 @@ def fit_network(
 
     Parameters
     ----------
-    comparisons : Comparisons
+    comparisons : Comparisons or Answers
+        As in `fit`.
     initial : model
         The starts, stacked along a leading axis, for instance ``MLPCost.random(..., shape=(8,))``.
     key : JAX random key or int
         Draws the split and the mini-batches.
-    validation : Comparisons, optional
+    validation : Comparisons or Answers, optional
         Held-out answers of your own, for instance about other trajectories. Default: a random
         share of ``validation_fraction`` of the pairs.
     l2 : float
@@ -120,8 +119,8 @@ def fit_network(
         Of Adam, with decay rates 0.9 and 0.999.
     max_epochs, patience : int
     batch_size : int
-        Data sets with more pairs are passed over in random mini-batches, as few and as equal as
-        this size allows: in an epoch each pair comes up once.
+        Data sets with more pairs, or choices, are passed over in random mini-batches, as few and as
+        equal as this size allows: in an epoch each of them comes up once.
     progress : bool
         Show a progress bar.
 
@@ -132,7 +131,7 @@ def fit_network(
     """
     require_x64()
     began = time.perf_counter()
-    instance("comparisons", comparisons, Comparisons)
+    check_data("comparisons", comparisons)
     starts = check_starts(comparisons, initial)
     settings = nonnegative("l2", l2), nonnegative("learning_rate", learning_rate)
     rounds = -(-positive_int("max_epochs", max_epochs) // CHECK_EVERY)
@@ -143,17 +142,18 @@ def fit_network(
     rng, progress = generator(key), flag("progress", progress)
     validation_fraction = share("validation_fraction", validation_fraction)
     training, held_out = _split(comparisons, validation, validation_fraction, rng)
-    data = pair_data(starts, training, padded_size(len(training)))
-    test = pair_data(starts, held_out, padded_size(len(held_out), 128))
+    task = Task.of(starts, training, held_out)
+    data, test = task.data(training), task.data(held_out, 128)
+    count = int(data.weights.sum())
 
-    record = _Record.of(_begin(starts))
+    record = _Record.of(_begin(task.starts))
     for _ in _bar(rounds, progress):
-        batches = _batches(len(training), data.labels.size, batch_size, rng)
+        batches = _batches(count, data.weights.size, batch_size, rng)
         state, losses = _advance(record.state, data, test, settings, batches)
         record.add(state, losses, patience)
         if not record.running.any():
             break
-    result = record.result(time.perf_counter() - began)
+    result = record.result(task, time.perf_counter() - began)
     warn_of_failure(result)
     return result
 
@@ -193,14 +193,15 @@ class _Record:
         self.best_at = np.where(better, check, self.best_at)
         self.running = self.running & self.finite & (check - self.best_at < patience)
 
-    def result(self, seconds: float) -> NetworkFit:
+    def result(self, task: Task, seconds: float) -> NetworkFit:
         """Return what came of it."""
         usable = self.finite & np.isfinite(self.lowest)
         status = np.where(self.running, "max_epochs", "stopped").astype("<U10")
         status[~usable] = "not_finite"
         trained, held = np.stack(self.losses, axis=1)
+        models, thresholds = task.split(self.best)
         return NetworkFit(
-            models=self.best,
+            models=models,
             chosen=int(np.argmin(np.where(usable, self.lowest, np.inf))) if usable.any() else None,
             validation_loss=held,
             training_loss=trained,
@@ -208,14 +209,15 @@ class _Record:
             best=self.best_at,
             status=status,
             seconds=seconds,
+            thresholds=thresholds,
         )
 
 
 def _split(
-    comparisons: Comparisons, validation: Any, fraction: float, rng: np.random.Generator
-) -> tuple[Comparisons, Comparisons]:
+    comparisons: Any, validation: Any, fraction: float, rng: np.random.Generator
+) -> tuple[Any, Any]:
     if validation is not None:
-        instance("validation", validation, Comparisons)
+        check_data("validation", validation)
         return comparisons, validation
     held = held_out_count(len(comparisons), fraction)
     if not held:
@@ -261,9 +263,7 @@ def _begin(starts: Any) -> tuple[Any, Any]:
 
 
 @jax.jit
-def _advance(
-    state: Any, data: PairData, test: PairData, settings: Any, batches: Any
-) -> tuple[Any, Any]:
+def _advance(state: Any, data: Any, test: Any, settings: Any, batches: Any) -> tuple[Any, Any]:
     """Train for ten epochs; return the state, and the losses of trained and held-out answers."""
     l2, learning_rate = settings
 
@@ -271,7 +271,7 @@ def _advance(
         bounds = model.bounds()
 
         def step(k: Any, carry: tuple[Any, Any]) -> tuple[Any, Any]:
-            part = data if batches is None else _part(data, batches[0][k])
+            part = data if batches is None else data.part(batches[0][k])
             slope = jax.grad(objective)(carry[0], part, l2)
             return adam_step(*carry, slope, bounds, learning_rate)
 
@@ -280,19 +280,3 @@ def _advance(
         return (model, memory), (cross_entropy(model, data), cross_entropy(model, test))
 
     return jax.vmap(one)(*state)
-
-
-def _part(data: PairData, chosen: Any) -> PairData:
-    """Return a mini-batch: only its own trajectories are scored.
-
-    An index behind the last pair stands for none: a weight of 0, with some other pair's numbers.
-    """
-    labels = data.labels[chosen]
-    weights = data.weights.at[chosen].get(mode="fill", fill_value=0.0)
-    if data.sides is None:
-        features = jax.tree.map(lambda leaf: leaf[chosen], data.features)
-        return PairData(None, features, labels, weights)
-    used = jnp.concatenate([side[chosen] for side in data.sides])
-    features = jax.tree.map(lambda leaf: leaf[used], data.features)
-    places = np.arange(2 * len(chosen)).reshape(2, -1)
-    return PairData((places[0], places[1]), features, labels, weights)

@@ -37,6 +37,34 @@ class PairData(NamedTuple):
     labels: Any
     weights: Any
 
+    def losses(self, model: Any) -> Any:
+        """Return −log P (n,) of the answers, from log-odds: it neither overflows nor saturates."""
+        return optax.sigmoid_binary_cross_entropy(logits(model, self), self.labels)
+
+    def hits(self, model: Any) -> Any:
+        """Return how much each answer says what the model does; equal costs count as "first"."""
+        return jnp.where(logits(model, self) >= 0, self.labels, 1 - self.labels)
+
+    def hold_out(self, index: np.ndarray) -> None:
+        """Give answers weight 0."""
+        self.weights[index] = 0.0
+
+    def part(self, chosen: Any) -> PairData:
+        """Return a mini-batch: only its own trajectories are scored.
+
+        An index behind the last pair stands for none: a weight of 0, with some other pair's
+        numbers.
+        """
+        labels = self.labels[chosen]
+        weights = self.weights.at[chosen].get(mode="fill", fill_value=0.0)
+        if self.sides is None:
+            features = jax.tree.map(lambda leaf: leaf[chosen], self.features)
+            return PairData(None, features, labels, weights)
+        used = jnp.concatenate([side[chosen] for side in self.sides])
+        features = jax.tree.map(lambda leaf: leaf[used], self.features)
+        places = np.arange(2 * len(chosen)).reshape(2, -1)
+        return PairData((places[0], places[1]), features, labels, weights)
+
 
 def pair_data(model: Any, comparisons: Comparisons, size: int | None = None) -> PairData:
     """Compute the features of all pairs once, padded with pairs of weight 0 to ``size``."""
@@ -48,7 +76,7 @@ def pair_data(model: Any, comparisons: Comparisons, size: int | None = None) -> 
     labels = np.concatenate([comparisons.labels, padding])
     weights = np.concatenate([np.ones(n), padding])
     if model.linear_in_features:
-        features = _features(model, comparisons.trajectories)
+        features = features_of(model, comparisons.trajectories)
         gap = jax.tree.map(lambda leaf: leaf[j] - leaf[i], features)
         return PairData(None, gap, labels, weights)
     used, sides = np.unique(np.stack([i, j]), return_inverse=True)
@@ -56,11 +84,12 @@ def pair_data(model: Any, comparisons: Comparisons, size: int | None = None) -> 
         spare = padded_size(len(used), SMALLEST_POOL) - len(used)
         used = np.concatenate([used, np.full(spare, used[0])])
     first, second = sides.reshape(2, size)
-    features = _features(model, comparisons.trajectories[used])
+    features = features_of(model, comparisons.trajectories[used])
     return PairData((first, second), features, labels, weights)
 
 
-def _features(model: Any, trajectories: Trajectory) -> Any:
+def features_of(model: Any, trajectories: Trajectory) -> Any:
+    """Return the features of a batch as NumPy arrays, or raise a ValueError: they are infinite."""
     with np.errstate(over="ignore"):  # said in one sentence below
         features = jax.tree.map(np.asarray, model.features(trajectories))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(features)):
@@ -80,16 +109,17 @@ def logits(model: Any, data: PairData) -> Any:
     return score[second] - score[first]
 
 
-def cross_entropy(model: Any, data: PairData) -> Any:
-    """Return the weighted mean of the logistic loss, the sum of eq. (6) of arXiv 2511.22502.
-
-    Computed from the log-odds, so that it neither overflows nor saturates.
-    """
-    losses = optax.sigmoid_binary_cross_entropy(logits(model, data), data.labels)
-    return jnp.vdot(data.weights, losses) / jnp.sum(data.weights)
+def cross_entropy(model: Any, data: Any) -> Any:
+    """Return the weighted mean of the losses, for pairs the sum of eq. (6) of arXiv 2511.22502."""
+    return jnp.vdot(data.weights, data.losses(model)) / jnp.sum(data.weights)
 
 
-def objective(model: Any, data: PairData, l2: Any = 1e-6, l1: Any = 0.0) -> Any:
+def accuracy(model: Any, data: Any) -> Any:
+    """Return the weighted share of the answers that the model gives."""
+    return jnp.vdot(data.weights, data.hits(model)) / jnp.sum(data.weights)
+
+
+def objective(model: Any, data: Any, l2: Any = 1e-6, l1: Any = 0.0) -> Any:
     """Return cross-entropy + l2·‖θ‖² + l1·‖θ‖₁: eq. (6) of arXiv 2511.22502, with ρ = ``l2``."""
     theta = jax.tree.leaves(model)
     ridge = sum(jnp.vdot(leaf, leaf) for leaf in theta)

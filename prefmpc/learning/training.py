@@ -14,7 +14,6 @@ import numpy as np
 
 from prefmpc._checks import (
     choice,
-    instance,
     nonnegative,
     positive_int,
     require_x64,
@@ -26,16 +25,12 @@ from prefmpc._random import generator
 from prefmpc._results import FitError, Restarts, warn_of_failure
 from prefmpc.learning._lbfgsb import minimise
 from prefmpc.learning._starts import check_starts, finite_models, held_out_count, projected_adam
-from prefmpc.learning.losses import (
-    PairData,
-    cross_entropy,
-    logits,
-    objective,
-    padded_size,
-    pair_data,
-)
+from prefmpc.learning.answer_losses import Task
+from prefmpc.learning.losses import accuracy, cross_entropy, objective
 from prefmpc.models.quadratic import CostModel, QuadraticCost
+from prefmpc.preferences.answers import Answers, check_data
 from prefmpc.preferences.comparisons import Comparisons
+from prefmpc.preferences.recordings import batches
 
 Selection = Literal["validation", "training_loss", "leaky_test_accuracy"]
 Status = Literal["converged", "max_iterations", "out_of_bounds", "not_finite"]
@@ -69,6 +64,8 @@ class FitResult(Restarts):
         Largest amount by which the solver left a weight outside its bounds.
     seconds : float
         Wall time, compilation included if there was one.
+    thresholds : dict of arrays (restarts, ...)
+        What was learned beside σ from `Answers`, by name: see `fit_map`. Empty for plain pairs.
     """
 
     NAME = "fit"
@@ -84,6 +81,7 @@ class FitResult(Restarts):
     error: np.ndarray
     bound_violation: np.ndarray
     seconds: float
+    thresholds: dict[str, np.ndarray] = dataclasses.field(default_factory=dict)
 
     @property
     def message(self) -> str:
@@ -100,14 +98,14 @@ class FitResult(Restarts):
 
 
 def fit(
-    comparisons: Comparisons,
+    comparisons: Comparisons | Answers,
     initial: CostModel | None = None,
     *,
     key: Any,
     restarts: int = 20,
     selection: Selection = "validation",
     validation_fraction: float = 0.2,
-    test: Comparisons | None = None,
+    test: Comparisons | Answers | None = None,
     l2: float = 1e-6,
     l1: float = 0.0,
     adam_steps: int = 200,
@@ -123,7 +121,9 @@ def fit(
 
     Parameters
     ----------
-    comparisons : Comparisons
+    comparisons : Comparisons or Answers
+        Thresholds of `Answers` (see `fit_map`) are learned along and belong to θ. The mean is over
+        all choices: a ranking is as many as it has places but the last.
     initial : model, optional
         The starts, stacked along a leading axis. Default: ``restarts`` random `QuadraticCost`.
     key : JAX random key or int
@@ -148,54 +148,54 @@ def fit(
     """
     require_x64()
     began = time.perf_counter()
-    instance("comparisons", comparisons, Comparisons)
+    check_data("comparisons", comparisons)
     n = len(comparisons)
     selection, held = _selection(n, selection, validation_fraction, test)
     l2, l1, tol = nonnegative("l2", l2), nonnegative("l1", l1), nonnegative("tol", tol)
     learning_rate = nonnegative("learning_rate", learning_rate)
     rng, restarts = generator(key), positive_int("restarts", restarts)
     if initial is None:
-        nx, nu = comparisons.trajectories.x.shape[-1], comparisons.trajectories.u.shape[-1]
+        pool = batches(comparisons.trajectories)[0]
+        nx, nu = pool.x.shape[-1], pool.u.shape[-1]
         starts: Any = QuadraticCost.random(nx, nu, key=rng, shape=(restarts,))
     else:
         starts = check_starts(comparisons, initial)
     settings = (l2, l1, learning_rate, positive_int("max_iterations", max_iterations), tol)
     adam_steps = positive_int("adam_steps", adam_steps)
 
-    data = pair_data(starts, comparisons, padded_size(n))
+    task = Task.of(starts, comparisons, test)
+    data = task.data(comparisons)
     held_out = rng.permutation(n)[:held] if held else np.zeros(0, dtype=int)
-    data.weights[held_out] = 0.0
+    data.hold_out(held_out)
     split_signs = l1 > 0  # |θ| is smooth only where θ is split into its two signs
     with traced("initial"):
-        out = _train(starts, data, settings, adam_steps, split_signs)
+        out = _train(task.starts, data, settings, adam_steps, split_signs)
     trained = _Trained(*to_numpy(out))
     status, loss = _status(trained, tol), trained.training_loss
     if selection == "training_loss":
         score = loss
     else:
         judges = comparisons.subset(held_out) if test is None else test
-        losses, errors = _scores(
-            trained.models, pair_data(starts, judges, padded_size(len(judges)))
-        )
+        losses, errors = _scores(trained.models, task.data(judges))
         score = np.asarray(losses if test is None else errors)
+    models, thresholds = task.split(trained.models)
     result = FitResult(
-        **trained._asdict(),
+        **trained._replace(models=models)._asdict(),
         chosen=best_restart(score, status, loss),
         selection=selection,
         selection_score=score,
         status=status,
         seconds=time.perf_counter() - began,
+        thresholds=thresholds,
     )
     warn_of_failure(result)
     return result
 
 
-def _selection(
-    n: int, selection: Selection, fraction: float, test: Comparisons | None
-) -> tuple[Selection, int]:
+def _selection(n: int, selection: Selection, fraction: float, test: Any) -> tuple[Selection, int]:
     """Return how to choose among the restarts, and how many pairs are kept out for that."""
     if test is not None:
-        instance("test", test, Comparisons)
+        check_data("test", test)
     choice("selection", selection, get_args(Selection))
     fraction = share("validation_fraction", fraction)
     if (test is None) == (selection == "leaky_test_accuracy"):
@@ -246,7 +246,7 @@ def best_restart(score: Any, status: np.ndarray, loss: np.ndarray) -> int | None
 
 @jax.jit(static_argnums=(3, 4))
 def _train(
-    starts: Any, data: PairData, settings: tuple[Any, ...], adam_steps: int, split_signs: bool
+    starts: Any, data: Any, settings: tuple[Any, ...], adam_steps: int, split_signs: bool
 ) -> _Trained:
     l2, l1, learning_rate, max_iterations, tol = settings
 
@@ -272,8 +272,7 @@ def _train(
         rounding = violation <= BOUND_ROUNDING
         inside = jax.tree.map(jnp.clip, model, *bounds)
         model = jax.tree.map(lambda a, b: jnp.where(rounding, a, b), inside, model)
-        accuracy = _accuracy(logits(model, data), data)
-        return _Trained(model, loss(model), accuracy, iterations, error, violation)
+        return _Trained(model, loss(model), accuracy(model, data), iterations, error, violation)
 
     # One after another: the solver's branches are then branches, compiled in half the time, and
     # no restart waits for the slowest.
@@ -281,17 +280,11 @@ def _train(
     return trained
 
 
-def _accuracy(z: Any, data: PairData) -> Any:
-    """Return the share of the answers that log-odds z give; equal costs count as "first"."""
-    hits = jnp.where(z >= 0, data.labels, 1 - data.labels)
-    return jnp.vdot(data.weights, hits) / jnp.sum(data.weights)
-
-
 @jax.jit
-def _scores(models: Any, data: PairData) -> tuple[Any, Any]:
+def _scores(models: Any, data: Any) -> tuple[Any, Any]:
     """Return the cross-entropy and the share of wrong answers of each model (m,)."""
 
     def one(model: Any) -> tuple[Any, Any]:
-        return cross_entropy(model, data), 1 - _accuracy(logits(model, data), data)
+        return cross_entropy(model, data), 1 - accuracy(model, data)
 
     return jax.vmap(one)(models)

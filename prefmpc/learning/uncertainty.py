@@ -17,6 +17,7 @@ from prefmpc._results import Result, warn_of_failure
 from prefmpc.learning._chart import Chart, Laplace, laplaces, minus_log_posterior
 from prefmpc.learning.convex import Interval, MapResult
 from prefmpc.models.quadratic import QuadraticCost
+from prefmpc.preferences.comparisons import Comparisons
 from prefmpc.preferences.trajectories import Trajectory
 
 CHAINS = 32
@@ -125,6 +126,8 @@ def posterior(result: MapResult, *, draws: int = 1024, key: Any = 0) -> Posterio
         If an argument is out of range.
     """
     instance("result", result, MapResult)
+    if not isinstance(result.comparisons, Comparisons):
+        raise ValueError("result must be learned from Comparisons, got one from Answers")
     began = time.perf_counter()
     steps = max(8, -(-positive_int("draws", draws) // CHAINS))
     result.check()

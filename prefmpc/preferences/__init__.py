@@ -1,5 +1,6 @@
 """What people see and what they answer: trajectories, pools of them, preferences Π, comparisons."""
 
+from prefmpc.preferences.answers import Answers
 from prefmpc.preferences.comparisons import Comparisons
 from prefmpc.preferences.people import (
     Criterion,
@@ -13,6 +14,7 @@ from prefmpc.preferences.people import (
     one_by_one,
 )
 from prefmpc.preferences.pools import lqr_pool, random_states, random_weights
+from prefmpc.preferences.recordings import Recordings
 from prefmpc.preferences.trajectories import (
     Moments,
     Trajectory,
@@ -25,11 +27,13 @@ from prefmpc.preferences.trajectories import (
 )
 
 __all__ = [
+    "Answers",
     "Comparisons",
     "Criterion",
     "Moments",
     "Preference",
     "QuadraticPreference",
+    "Recordings",
     "SettlingTimePreference",
     "Trajectory",
     "by_criterion",

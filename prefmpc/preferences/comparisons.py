@@ -16,6 +16,7 @@ from prefmpc._files import atomic_write
 from prefmpc._pytree import set_fields, stacked
 from prefmpc._random import generator
 from prefmpc.preferences.logs import answers_of, read
+from prefmpc.preferences.names import names_of
 from prefmpc.preferences.people import Preference, asked
 from prefmpc.preferences.trajectories import Trajectory, check_finite
 
@@ -25,7 +26,10 @@ _OPTIONAL = dict.fromkeys(("x_r", "u_r", "y_r", "u_before"), 2)
 A file has the least version that holds all that is in it: who reads older ones refuses it instead
 of losing a part.
 """
-_FORMAT_VERSIONS = tuple(range(1, 1 + max(_OPTIONAL.values())))
+_WHO = 3
+"""The version that brought who gave each answer."""
+
+_FORMAT_VERSIONS = tuple(range(1, 1 + _WHO))
 
 
 @dataclasses.dataclass(frozen=True, eq=False, init=False)
@@ -40,23 +44,31 @@ class Comparisons:
         Which trajectories stand in each pair.
     labels : array (n,)
         P(first is preferred) in [0, 1]: 1 first, 0 second, 0.5 cannot say.
+    who : array (n,) of whole numbers or of texts, optional
+        Who gave each answer. Two names that differ in blanks or in case only raise a UserWarning.
 
     Raises
     ------
     ValueError
-        If there is no pair, an index points nowhere, a label lies outside [0, 1], or a trajectory
-        holds NaN.
+        If there is no pair, an index points nowhere, a label lies outside [0, 1], a trajectory
+        holds NaN, or ``who`` does not name somebody for each label.
     """
 
     trajectories: Trajectory
     first: np.ndarray
     second: np.ndarray
     labels: np.ndarray
+    who: np.ndarray | None
 
     def __init__(
-        self, trajectories: Trajectory, first: ArrayLike, second: ArrayLike, labels: ArrayLike
+        self,
+        trajectories: Trajectory,
+        first: ArrayLike,
+        second: ArrayLike,
+        labels: ArrayLike,
+        who: Any = None,
     ) -> None:
-        _check_pool(trajectories)
+        check_pool(trajectories)
         labels = np.asarray(finite_array("labels", labels, ndim=1, booleans=True))
         if labels.size == 0:
             raise ValueError("labels must hold at least one comparison, got an empty data set")
@@ -67,7 +79,9 @@ class Comparisons:
             )
         first = _pair_indices("first", first, labels.size, len(trajectories))
         second = _pair_indices("second", second, labels.size, len(trajectories))
-        set_fields(self, trajectories=trajectories, first=first, second=second, labels=labels)
+        who = names_of(who, labels.size)
+        pairs = {"first": first, "second": second, "labels": labels, "who": who}
+        set_fields(self, trajectories=trajectories, **pairs)
 
     def __len__(self) -> int:
         """Number of comparisons n_p."""
@@ -100,7 +114,7 @@ class Comparisons:
             Draw only pairs with the same x(0), so that nothing but the control differs. The
             trajectories must then hold some that start alike (see `lqr_pool`).
         """
-        _check_pool(trajectories)
+        check_pool(trajectories)
         function("preference", preference, 2)
         size = positive_int("size", size)
         count = len(trajectories)
@@ -134,6 +148,7 @@ class Comparisons:
         *,
         y_first: ArrayLike | None = None,
         y_second: ArrayLike | None = None,
+        who: Any = None,
     ) -> Comparisons:
         """Build a data set from your own recordings: plain arrays and labels.
 
@@ -144,6 +159,8 @@ class Comparisons:
         labels : array (n,)
             P(first is preferred): 1 first, 0 second, 0.5 cannot say.
         y_first, y_second : array (n, N, ny), optional
+        who : array (n,), optional
+            Who gave each answer.
         """
         first = _recorded("first", x_first, u_first, y_first)
         second = _recorded("second", x_second, u_second, y_second)
@@ -159,7 +176,7 @@ class Comparisons:
         if answers.size and answers.shape != (n,):
             raise ValueError(f"labels must have shape ({n},), one a pair, got {answers.shape}")
         both = jax.tree.map(lambda a, b: np.concatenate([a, b]), first, second)
-        return cls(both, np.arange(n), np.arange(n, 2 * n), answers)
+        return cls(both, np.arange(n), np.arange(n, 2 * n), answers, who)
 
     def subset(self, index: ArrayLike) -> Comparisons:
         """Return the comparisons chosen by an integer or boolean index, in that order."""
@@ -171,8 +188,12 @@ class Comparisons:
             fits = chosen.ndim == 1 and chosen.size > 0 and bool(inside.all())
         if not fits:
             raise ValueError(f"index must choose among the {n} comparisons, got {chosen}")
-        pairs = {"first": self.first, "second": self.second, "labels": self.labels}
-        return self._with(**{name: value[chosen] for name, value in pairs.items()})
+        return self._with(**{name: value[chosen] for name, value in self._each().items()})
+
+    def _each(self) -> dict[str, np.ndarray]:
+        """Return what there is one of for each comparison, by name."""
+        names = ("first", "second", "labels") + (() if self.who is None else ("who",))
+        return {name: getattr(self, name) for name in names}
 
     def _with(self, **changed: Any) -> Comparisons:
         """Return a copy in which some fields are others."""
@@ -206,10 +227,10 @@ class Comparisons:
         arrays = {"x": T.x, "u": T.u, "y": T.y}
         optional = {name: getattr(T, name) for name in _OPTIONAL}
         optional = {name: value for name, value in optional.items() if value is not None}
-        pairs = {"first": self.first, "second": self.second, "labels": self.labels}
         # A reader that does not know set points must refuse them, not lose them.
         version = max((_OPTIONAL[name] for name in optional), default=1)
-        stored = {"format_version": version, **arrays, **optional, **pairs}
+        version = version if self.who is None else _WHO
+        stored = {"format_version": version, **arrays, **optional, **self._each()}
         return {name: np.asarray(value) for name, value in stored.items()}
 
     @classmethod
@@ -241,7 +262,8 @@ class Comparisons:
             )
         optional = {name: stored[name] for name in _OPTIONAL if name in stored}
         trajectories = Trajectory(stored["x"], stored["u"], stored["y"], **optional)
-        return cls(trajectories, stored["first"], stored["second"], stored["labels"])
+        first, second, labels = (stored[name] for name in ("first", "second", "labels"))
+        return cls(trajectories, first, second, labels, stored.get("who"))
 
 
 def compared(first: list[Trajectory], second: list[Trajectory], labels: np.ndarray) -> Comparisons:
@@ -263,7 +285,8 @@ def _recorded(side: str, x: ArrayLike, u: ArrayLike, y: ArrayLike | None) -> Tra
         raise ValueError(f"{names} do not fit: {error}") from None
 
 
-def _check_pool(trajectories: Any) -> None:
+def check_pool(trajectories: Any) -> None:
+    """Raise a ValueError unless these are trajectories with one leading dimension, all finite."""
     if not isinstance(trajectories, Trajectory):
         raise ValueError(
             f"trajectories must be a Trajectory, got {type(trajectories).__name__}; "
