@@ -5,6 +5,7 @@ It takes a minute, and so runs with PREFMPC_LAB=1 alone: `make test-lab`.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import socket
@@ -96,11 +97,23 @@ def opened(browser: Browser, address: str) -> None:
 
 
 def run_cell(browser: Browser, count: int) -> None:
-    """Run the cell, and wait until it asks the question after so many answers."""
-    browser("document.querySelector('.jp-CodeCell .cm-content').focus()")
+    """Run the cell, and wait until it asks the question after so many answers.
+
+    A slow server asks which kernel is meant, once it is there.
+    """
+    running = (
+        "document.querySelector('.jp-CodeCell .jp-InputPrompt').textContent.includes('*')"
+        " || document.querySelector('.ask-count') !== null"
+    )
     enter = {"key": "Enter", "windowsVirtualKeyCode": 13, "modifiers": 8, "text": "\r"}
-    for kind in ("keyDown", "keyUp"):
-        browser.call("Input.dispatchKeyEvent", type=kind, **enter)
+    for _ in range(LONG // 5):
+        browser("document.querySelector('.jp-Dialog-button.jp-mod-accept')?.click()")
+        browser("document.querySelector('.jp-CodeCell .cm-content').focus()")
+        for kind in ("keyDown", "keyUp"):
+            browser.call("Input.dispatchKeyEvent", type=kind, **enter)
+        with contextlib.suppress(TimeoutError):
+            browser.wait(running, 5)
+            break
     wait_for(browser, count)
 
 
