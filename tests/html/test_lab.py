@@ -38,7 +38,7 @@ cart = LinearSystem.from_continuous([[0, 1], [0, -0.1]], [[0], [1]], dt=0.1, u_m
 interview = Interview(cart, x0=[1.0, 0.5], key=0, samples=40)
 ask(interview, log="answers.jsonl", who="A7", level=0, most=100)
 """
-LONG = 120
+LONG = 300
 ACCEPT = "document.querySelector('.jp-Dialog-button.jp-mod-accept')"
 IDLE = "document.querySelector('.jp-Notebook-ExecutionIndicator')?.dataset.status === 'idle'"
 WAYS = (("first", 1.0), ("ArrowRight", 0.0), ("ArrowDown", 0.5))
