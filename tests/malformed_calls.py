@@ -382,7 +382,7 @@ def valid_calls():
             {
                 **{"controller": p.LinearMPC(SYSTEM, COST, 3), "precision": "double"},
                 **{"tol": 1e-6, "max_iterations": 100, "states": np.ones((1, 2))},
-                **{"reference": target, "steps": 2, "overwrite": False},
+                **{"reference": target, "steps": 2, "overwrite": False, "disturbance": False},
             },
         ),
         "ReferenceTracker": (
