@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from jax.typing import ArrayLike
 
-from prefmpc._checks import choice, finite_array, flag, instance, positive, positive_int, shaped
+from prefmpc._checks import choice, finite_array, flag, instance, positive_int, shaped, share
 from prefmpc.mpc._affine import AffineProgram
 from prefmpc.mpc._c_files import constants, filled, recording, sizes, told
 from prefmpc.mpc.qp import LinearMPC
@@ -96,7 +96,7 @@ def export_c(
     precision : "double" or "float"
     tol : float, optional
         What counts as solved: the largest violation of the optimality conditions relative to the
-        size of their terms, at least 1. Default: 1e-6 in double, 1e-4 in float.
+        size of their terms, at least 1; below 1. Default: 1e-6 in double, 1e-4 in float.
     max_iterations : int
         The largest number of iterations of a step.
     states : array (m, nx), optional
@@ -120,7 +120,7 @@ def export_c(
     """
     instance("controller", controller, LinearMPC)
     choice("precision", precision, get_args(Precision))
-    tol = (1e-6 if precision == "double" else 1e-4) if tol is None else positive("tol", tol)
+    tol = (1e-6 if precision == "double" else 1e-4) if tol is None else share("tol", tol)
     max_iterations = positive_int("max_iterations", max_iterations)
     steps, overwrite = positive_int("steps", steps), flag("overwrite", overwrite)
     disturbance = flag("disturbance", disturbance)
