@@ -84,7 +84,10 @@ def valid_calls():
     target = p.steady_state(SYSTEM, [0.0, 0.0])
     nets = p.MLPCost.random([1.0, 1, 1], key=KEY, widths=(2,), shape=(2,))
     tracker = p.ReferenceTracker(p.LinearMPC(SYSTEM, COST, 3), [0.0, 0.0])
-    nonlinear = p.NonlinearMPC(SYSTEM, COST, 3)
+    nonlinear, controller = p.NonlinearMPC(SYSTEM, COST, 3), p.LinearMPC(SYSTEM, COST, 3)
+    noise = {"state_noise": np.ones(2), "output_noise": np.ones(2), "disturbance_noise": np.ones(1)}
+    noise |= {"B_d": np.ones((2, 1)), "C_d": np.zeros((2, 1))}
+    estimator = p.KalmanEstimator(SYSTEM, **noise)
     interview = AN_INTERVIEW()
     names = ["x1", "x2", "u1"]
     deviations = {"x_r": np.ones(2), "u_r": np.ones(1), "y_r": np.ones(2), "u_before": np.ones(1)}
@@ -325,10 +328,36 @@ def valid_calls():
             },
         ),
         # controllers
-        "LinearMPC": (p.LinearMPC, {**MPC, "terminal": ingredients}),
+        "LinearMPC": (
+            p.LinearMPC,
+            {
+                **{**MPC, "terminal": ingredients, "soft": np.ones(6), "soft_quadratic": 1.0},
+                **{"max_increment": np.ones(1), "blocks": [1, 2]},
+            },
+        ),
         "LinearMPC.solve": (
             p.LinearMPC(SYSTEM, COST, 3).solve,
-            {"x0": np.ones(2), "reference": target},
+            {
+                **{"x0": np.ones(2), "reference": target, "disturbance": np.zeros(2)},
+                "u_before": np.zeros(1),
+            },
+        ),
+        "LinearMPC.from_json": (p.LinearMPC.from_json, {"text": controller.to_json()}),
+        "matrices": (p.matrices, {"controller": controller}),
+        "KalmanEstimator": (p.KalmanEstimator, {"system": SYSTEM, **noise}),
+        "KalmanEstimator.reset": (estimator.reset, {"x0": np.ones(2)}),
+        "KalmanEstimator.corrected": (estimator.corrected, {"y": np.ones(2)}),
+        "KalmanEstimator.predict": (
+            lambda u: estimator.predict(estimator.corrected(np.ones(2)), u),
+            {"u": np.ones(1)},
+        ),
+        "OutputFeedback": (
+            p.OutputFeedback,
+            {"controller": controller, "estimator": estimator, "y_r": np.zeros(2)},
+        ),
+        "OutputFeedback.track": (
+            p.OutputFeedback(controller, estimator).track,
+            {"y_r": np.zeros(2)},
         ),
         "ConvexMPC": (
             p.ConvexMPC,
@@ -356,7 +385,7 @@ def valid_calls():
             {
                 **{"controller": p.LinearMPC(SYSTEM, COST, 3), "precision": "double"},
                 **{"tol": 1e-6, "max_iterations": 100, "states": np.ones((1, 2))},
-                **{"reference": target, "steps": 2, "overwrite": False},
+                **{"reference": target, "steps": 2, "overwrite": False, "disturbance": False},
             },
         ),
         "ReferenceTracker": (
@@ -372,6 +401,7 @@ def valid_calls():
             {
                 **{"system": SYSTEM, "y_r": np.zeros(2), "constraints": LIMITS},
                 **{"start": (np.zeros(2), np.zeros(1)), "nearest": False},
+                "disturbance": np.zeros(2),
             },
         ),
         "closed_loops": (

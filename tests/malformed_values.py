@@ -201,7 +201,16 @@ None, prior | Interview: prior
 digits, text | title
 None, digits, text | draw
 None | Interview.to_html: names, Interview.to_html: units, ask: names, ask: units
-True | Interview.to_html: overwrite
+True | overwrite, export_c: disturbance
+1.5, 10^30, inf, None, flatter, with 1e308, with inf | max_increment
+1.5, 10^30, inf, flatter, with 1e308, with inf | soft
+0, 1.5, 10^30 | soft_quadratic
+None | blocks, export_c: tol, KalmanEstimator.reset: x0
+None, negative | B_d, C_d
+None, negative, with 1e308 | OutputFeedback: y_r, y_r
+None, longer, negative | states
+None, trajectory | LinearMPC.solve: reference
+None, negative | disturbance
 """
 """What is right after all | for which argument of all calls, or of one call, which goes before."""
 

@@ -14,6 +14,7 @@ from prefmpc import (
     LinearSystem,
     Polyhedron,
     QuadraticCost,
+    SteadyState,
     cart_pendulum,
     export_c,
     oscillating_masses,
@@ -82,6 +83,7 @@ def cases():
     spread = steady_state(MASSES, [0.2, 0.2, 0.2], nearest=True)
     away = steady_state(cart, [0.5, 0.0], nearest=True)
     up = steady_state(quad, [0, 0, 0, 0, 0, 1.0])
+    rolling = LinearSystem([[1, 0.1], [0, 1]], [[0.005], [0.1]], dt=0.1, u_min=-1, u_max=1)
     wide, near = 0.5 * np.ones(6), np.array([0.4, 0.08, 0.1, 0.1])
     end = terminal_ingredients(MASSES, PAPER)
     return {
@@ -89,6 +91,15 @@ def cases():
         "masses elsewhere": (LinearMPC(MASSES, PAPER, 10, constraints=ROOM), spread, wide),
         "pendulum on a rail": (LinearMPC(cart, upright, 20, constraints=rail), away, near),
         "quadrotor": (LinearMPC(quad, quad_cost, 10, constraints=tilt), up, 0.1 * np.ones(12)),
+        "options": (
+            LinearMPC(
+                *(rolling, QuadraticCost(np.eye(2), [[0.1]]), 8),
+                **{"constraints": Polyhedron.box([-1, -0.4, -1], [1, 0.4, 1]), "soft": 30.0},
+                **{"soft_quadratic": 30.0, "max_increment": 0.5, "blocks": [1, 1, 2, 4]},
+            ),
+            None,
+            np.array([1.1, 0.5]),
+        ),
         "terminal": (LinearMPC(MASSES, PAPER, 10, terminal=end), None, 0.3 * wide),
     }
 
@@ -139,10 +150,12 @@ def number(said, text):
 @pytest.mark.parametrize("name", CASES)
 def test_a_thousand_steps_in_c_are_those_in_python(name, tmp_path, objects):
     controller, reference, radius = CASES[name]
-    options = {"reference": reference, "states": starts(radius)}
+    # Fewer steps for what takes many iterations, or is much like another.
+    steps = {"options": 200, "masses elsewhere": 300, "terminal": 100}.get(name, 1000)
+    options = {"reference": reference, "states": starts(radius), "steps": steps}
     made = export_c(controller, tmp_path / "mpc", tol=2e-8, max_iterations=5000, **options)
     said = build(made.folder, STRICT, objects, "check")
-    assert number("steps", said) == 1000
+    assert number("steps", said) == steps
     assert number("not solved", said) == 0
     assert number("largest difference of an input", said) < 1e-6
     assert number("largest difference of a state", said) < 1e-6
@@ -169,6 +182,42 @@ def test_in_float_it_is_small_and_allocates_nothing(tmp_path, objects):
     # Of the C library it needs nothing but copying, at most.
     outside = used - symbols(made.folder, "--defined-only")
     assert outside - {"_GLOBAL_OFFSET_TABLE_"} <= {"memcpy", "memset", "strcpy", "memmove"}
+
+
+PUSHED = """
+#include <stdio.h>
+#include "mpc.h"
+int main(void)
+{
+    mpc_float x[MPC_NX] = {0.2, -0.1}, d[MPC_NX] = {0.01, 0.03}, u[MPC_NU] = {0};
+    mpc_float x_r[MPC_NX] = {0.3, -0.1}, u_r[MPC_NU] = {-0.3};
+    mpc_init();
+    printf("%d ", (int)mpc_reference(x_r, u_r));
+    printf("%d ", (int)mpc_disturbance(d));
+    printf("%d ", (int)mpc_reference(x_r, u_r));
+    printf("%d", (int)mpc_step(x, u));
+    printf(" %.12g\\n", (double)u[0]);
+    return 0;
+}
+"""
+
+
+@COMPILED
+def test_a_disturbance_in_c(tmp_path, objects):
+    cart = LinearSystem([[1, 0.1], [0, 1]], [[0.0], [0.1]], dt=0.1, u_min=-1, u_max=1)
+    wall = Polyhedron.box([-1, -5, -1], [0.5, 5, 1])
+    controller = LinearMPC(cart, QuadraticCost(np.eye(2), [[0.1]]), 15, constraints=wall)
+    options = {"disturbance": True, "tol": 1e-9, "steps": 50, "states": [[0.2, 0.1], [0.4, -0.2]]}
+    made = export_c(controller, tmp_path / "mpc", **options)
+    (made.folder / "main.c").write_text(PUSHED)
+    build(made.folder, STRICT, objects, "replay")
+    said = subprocess.run(["./replay"], cwd=made.folder, capture_output=True, text=True).stdout
+    d = [0.01, 0.03]
+    held = SteadyState(np.array([0.3, -0.1]), np.array([-0.3]), np.array([0.3, -0.1]))
+    wanted = controller.solve([0.2, -0.1], reference=held, disturbance=d).u[0]
+    *codes, u = said.split()
+    assert codes == ["4", "0", "0", "0"]  # a steady state under the disturbance only
+    assert float(u) == pytest.approx(wanted, abs=1e-7)
 
 
 ASKED = """

@@ -5,6 +5,7 @@ from prefmpc.mpc.convex import ConvexMPC
 from prefmpc.mpc.export import CExport, export_c
 from prefmpc.mpc.feedback import KalmanEstimator, OutputFeedback
 from prefmpc.mpc.loops import ClosedLoops, closed_loops, mpc_rollout
+from prefmpc.mpc.matrices import matrices
 from prefmpc.mpc.nonlinear import NonlinearMPC
 from prefmpc.mpc.qp import LinearMPC
 from prefmpc.mpc.solution import MPCError, MPCSolution
@@ -31,6 +32,7 @@ __all__ = [
     "check_stability",
     "closed_loops",
     "export_c",
+    "matrices",
     "mpc_rollout",
     "steady_state",
     "terminal_ingredients",

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg
 import scipy.sparse as sp
 
+from prefmpc.mpc._options import OptionProgram
 from prefmpc.mpc.qp import LinearMPC
 from prefmpc.mpc.steady import SteadyState
 
@@ -20,8 +21,9 @@ TINY = 1e-14
 class AffineProgram:
     """min ½ zᵀPz + (q + F p)ᵀz over lower ≤ rows z − E p ≤ upper; the first input is S z + T p.
 
-    p is the state and, where there can be one, the set point (x_r, u_r). The first ``equations``
-    rows are the dynamics; these determine the first ``equations`` entries of z.
+    p is the state and, where there can be one, the set point (x_r, u_r), a constant disturbance,
+    the input before. The first ``equations`` rows are the dynamics; these determine as many
+    entries of z, after which come ``inputs`` ones.
     """
 
     P: Any
@@ -34,23 +36,29 @@ class AffineProgram:
     S: np.ndarray
     T: np.ndarray
     equations: int
+    inputs: int
 
     @classmethod
-    def of(cls, controller: LinearMPC) -> AffineProgram:
+    def of(cls, controller: LinearMPC, *, disturbance: bool = False) -> AffineProgram:
         """Return the sparse form, found by asking the controller for its limits."""
         program, system = controller._program, controller.system
-        nx, nu = system.nx, system.nu
-        size = nx if controller._ingredients else 2 * nx + nu
+        nx, nu, N = system.nx, system.nu, controller.horizon
+        stepped = isinstance(program, OptionProgram) and program.options.increment is not None
+        sizes = [nx, *((0, 0) if controller._ingredients else (nx, nu)), nx * disturbance]
+        ends = np.cumsum(sizes)
+        size = int(ends[-1]) + nu * stepped
         n, m = program.rows.shape[1], program.rows.shape[0]
         at = np.arange(program.equations, program.equations + nu)
 
         def parts(p: np.ndarray) -> np.ndarray:
-            x, x_r, u_r = np.split(p, [nx, 2 * nx])
+            x, x_r, u_r, d, before = np.split(p, ends)
             held = SteadyState(x_r, u_r, system.C @ x_r) if len(x_r) else None
-            bounds = program.bounds(x, held)
+            push = np.tile(d, (N, 1)) if len(d) else None
+            limits = program.limited(before) if isinstance(program, OptionProgram) else None
+            bounds = program.bounds(x, held, push, limits)
             origin = np.zeros(n) if bounds.origin is None else bounds.origin
-            limits = bounds.lower * bounds.unit, bounds.upper * bounds.unit
-            return np.concatenate([*limits, origin[at] * program.du])
+            both = bounds.lower * bounds.unit, bounds.upper * bounds.unit
+            return np.concatenate([*both, origin[at] * program.du])
 
         base = parts(np.zeros(size))
         with np.errstate(invalid="ignore"):
@@ -61,13 +69,15 @@ class AffineProgram:
         S = np.zeros((nu, n))
         S[np.arange(nu), at] = program.du
         nothing = np.zeros((n, size))
-        fixed = np.zeros(n), nothing, sp.csr_array(program.rows), lower, upper, E, S
-        return cls(sp.csr_array(program.P), *fixed, slopes[2 * m :], program.equations)
+        linear = getattr(program, "q", None)
+        q = np.zeros(n) if linear is None else linear
+        fixed = q, nothing, sp.csr_array(program.rows), lower, upper, E, S
+        return cls(sp.csr_array(program.P), *fixed, slopes[2 * m :], program.equations, N * nu)
 
     @property
     def condition(self) -> float:
-        """Condition of P, by eigenvalues."""
-        values = np.linalg.eigvalsh(self.P.toarray())
+        """Condition of the part of P that belongs to inputs, which come first, by eigenvalues."""
+        values = np.linalg.eigvalsh(self.P.toarray()[: self.inputs, : self.inputs])
         return float(values[-1] / values[0]) if values[0] > 0 else np.inf
 
     def condensed(self) -> AffineProgram:
@@ -104,6 +114,7 @@ class AffineProgram:
             self.S @ W,
             self.T + self.S @ Z,
             0,
+            self.inputs,
         )
 
     def merged(self) -> AffineProgram:

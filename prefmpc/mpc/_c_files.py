@@ -10,6 +10,7 @@ import numpy as np
 
 from prefmpc.mpc._affine import AffineProgram
 from prefmpc.mpc._limits import ON_LIMIT, input_size, row_sizes
+from prefmpc.mpc._stages import pushed_states
 from prefmpc.mpc._target import input_sizes
 from prefmpc.mpc.qp import LinearMPC
 from prefmpc.mpc.steady import SteadyState
@@ -29,7 +30,9 @@ def filled(name: str, values: dict[str, str]) -> str:
     return out
 
 
-def sizes(controller: LinearMPC, precision: str, tol: float, max_iterations: int) -> dict[str, str]:
+def sizes(
+    controller: LinearMPC, precision: str, tol: float, max_iterations: int, disturbance: bool
+) -> dict[str, str]:
     """Return what mpc.h and README.md say of a controller."""
     system = controller.system
     return {
@@ -41,8 +44,18 @@ def sizes(controller: LinearMPC, precision: str, tol: float, max_iterations: int
         "TOLERANCE": repr(tol),
         "HAS_REFERENCE": f"#define MPC_HAS_REFERENCE {int(not controller._ingredients)}"
         " /* whether there is mpc_reference */",
+        "HAS_DISTURBANCE": f"#define MPC_HAS_DISTURBANCE {int(disturbance)}"
+        " /* whether there is mpc_disturbance */",
+        "HAS_BEFORE": f"#define MPC_HAS_BEFORE {int(stepped(controller))}"
+        " /* whether there is mpc_before */",
         "FLOAT": precision,
     }
+
+
+def stepped(controller: LinearMPC) -> bool:
+    """Say whether increments are limited, so that the input before matters."""
+    options = controller._options
+    return options is not None and options.increment is not None
 
 
 class _Writer:
@@ -84,7 +97,9 @@ class _Writer:
         self.lines.append(f"static const data_matrix data_{name} = {{{parts}}};")
 
 
-def constants(controller: LinearMPC, program: AffineProgram, precision: str) -> str:
+def constants(
+    controller: LinearMPC, program: AffineProgram, precision: str, disturbance: bool
+) -> str:
     """Return mpc_data.h."""
     system, fixed = controller.system, controller._program.fixed
     w = _Writer(precision)
@@ -118,22 +133,35 @@ def constants(controller: LinearMPC, program: AffineProgram, precision: str) -> 
     w.matrix("from_state", program.T)
     w.vector("u_min", system.u_min)
     w.vector("u_max", system.u_max)
-    _checks_of(w, controller, size)
+    at = size - system.nu * stepped(controller)
+    w.define("BEFORE", str(at))
+    w.define("DISTURBANCE", str(at - system.nx))
+    _checks_of(w, controller, size, at - system.nx if disturbance else None)
     return "\n".join([*w.lines, "", "#endif", ""])
 
 
-def _checks_of(w: _Writer, controller: LinearMPC, size: int) -> None:
-    """Write what says whether a state or a set point is possible at all."""
+def _checks_of(w: _Writer, controller: LinearMPC, size: int, disturbed: int | None) -> None:
+    """Write what says whether a state or a set point is possible at all.
+
+    ``disturbed`` is where the disturbance begins among ``size`` parameters, if there is one.
+    """
     system, fixed = controller.system, controller._program.fixed
     double, plant = w.precision == "double", (system.A, system.B)
     if len(fixed._limits):
         w.define("ON_LIMIT", w.number(ON_LIMIT if double else 1e-5))
-        w.matrix("fixed", np.pad(fixed._map, ((0, 0), (0, size - system.nx))))
+        whole = np.zeros((len(fixed._map), size))
+        whole[:, : system.nx] = fixed._map
+        if disturbed is not None:
+            for i, d in enumerate(np.eye(system.nx)):
+                pushed = pushed_states(system.A, np.tile(d, (controller.horizon, 1)))
+                moved = (fixed._rows * pushed[fixed._stages]).sum(axis=1)
+                whole[:, disturbed + i] = moved
+        w.matrix("fixed", whole)
         w.vector("fixed_limit", fixed._limits)
         at_rest, u_size = np.zeros(system.nx), input_size(system.u_min, system.u_max)
         w.vector("fixed_size", row_sizes(*plant, u_size, at_rest, fixed._rows, fixed._limits))
     if not controller._ingredients:
-        Z = stage_constraints(system, controller._constraints)
+        Z = stage_constraints(system, controller._hard)
         w.define("REACHED", w.number(1e-6 if double else 1e-4))
         w.matrix("drift", np.concatenate([system.A - np.eye(system.nx), system.B], axis=1))
         w.vector("units", input_sizes(*plant, system.C, system.u_min, system.u_max))
@@ -182,15 +210,19 @@ def recording(
 ) -> Recording:
     """Return closed loops from the states, one after the other, of ``steps`` steps in all."""
     system, length = controller.system, min(RUN, steps)
-    X, U = [], []
+    X: list[list[np.ndarray]] = []
+    U: list[list[np.ndarray]] = []
     for x in states:
-        xs, us = [], []
+        xs: list[np.ndarray] = []
+        us: list[np.ndarray] = []
+        before = U[-1][-1] if U else np.zeros(system.nu)
         for _ in range(length):
-            solution = controller.solve(x, reference=reference)
+            solution = controller.solve(x, reference=reference, u_before=before)
             if solution.status != "solved":
                 break
             xs.append(x)
-            us.append(solution.u)
+            before = solution.u
+            us.append(before)
             x = system.step(x, solution.u)
         else:
             X.append(xs)

@@ -65,10 +65,12 @@ def restored(text: str, known: tuple[str, ...]) -> dict[str, Any]:
     cost = _fields("cost", fields["cost"], {"Q", "R"}, set())
     fields["system"] = _made("system", lambda: LinearSystem(**system))
     fields["cost"] = _made("cost", lambda: QuadraticCost(**cost))
+    if "soft" in fields:
+        fields["soft"] = _filled(fields["soft"], np.inf)
     if fields.get("constraints") is not None:
         fields["constraints"] = _set("constraints", fields["constraints"])
     if (end := fields.get("terminal")) is not None:
-        whole = isinstance(end, dict) and "K" in end
+        whole = isinstance(end, dict) and "H" not in end
         fields["terminal"] = _ingredients(end) if whole else _set("terminal", end)
     return fields
 
@@ -106,7 +108,8 @@ def _made(name: str, make: Callable[[], Any]) -> Any:
 
 
 def _set(name: str, data: Any) -> Polyhedron:
-    return _made(name, lambda: Polyhedron(**_fields(name, data, {"H", "h"}, set())))
+    fields = _fields(name, data, {"H", "h"}, set())
+    return _made(name, lambda: Polyhedron(**fields))
 
 
 def _ingredients(data: Any) -> TerminalIngredients:

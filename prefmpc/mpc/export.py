@@ -15,7 +15,7 @@ import numpy as np
 import scipy.sparse as sp
 from jax.typing import ArrayLike
 
-from prefmpc._checks import choice, finite_array, flag, instance, positive, positive_int, shaped
+from prefmpc._checks import choice, finite_array, flag, instance, positive_int, shaped, share
 from prefmpc.mpc._affine import AffineProgram
 from prefmpc.mpc._c_files import constants, filled, recording, sizes, told
 from prefmpc.mpc.qp import LinearMPC
@@ -76,6 +76,7 @@ def export_c(
     max_iterations: int = 1000,
     states: ArrayLike | None = None,
     reference: SteadyState | None = None,
+    disturbance: bool = False,
     steps: int = 1000,
     overwrite: bool = False,
 ) -> CExport:
@@ -95,7 +96,7 @@ def export_c(
     precision : "double" or "float"
     tol : float, optional
         What counts as solved: the largest violation of the optimality conditions relative to the
-        size of their terms, at least 1. Default: 1e-6 in double, 1e-4 in float.
+        size of their terms, at least 1; below 1. Default: 1e-6 in double, 1e-4 in float.
     max_iterations : int
         The largest number of iterations of a step.
     states : array (m, nx), optional
@@ -103,6 +104,8 @@ def export_c(
         unconstrained controller asks for 0.1 to 3 times what the inputs can do.
     reference : SteadyState, optional
         The set point of the recorded loops; the library takes any.
+    disturbance : bool
+        Whether the library takes a disturbance d, held over the horizon, x⁺ = A x + B u + d.
     steps : int
         Of all recorded loops together.
     overwrite : bool
@@ -117,17 +120,16 @@ def export_c(
     """
     instance("controller", controller, LinearMPC)
     choice("precision", precision, get_args(Precision))
-    tol = (1e-6 if precision == "double" else 1e-4) if tol is None else positive("tol", tol)
+    tol = (1e-6 if precision == "double" else 1e-4) if tol is None else share("tol", tol)
     max_iterations = positive_int("max_iterations", max_iterations)
     steps, overwrite = positive_int("steps", steps), flag("overwrite", overwrite)
+    disturbance = flag("disturbance", disturbance)
     target = Path(folder)
     if target.exists() and not overwrite:
         raise FileExistsError(f"{target} exists; pass overwrite=True to replace it")
     if reference is not None:
-        check_reference(
-            reference, controller.system, controller._constraints, controller._ingredients
-        )
-    sparse = AffineProgram.of(controller)
+        check_reference(reference, controller.system, controller._hard, controller._ingredients)
+    sparse = AffineProgram.of(controller, disturbance=disturbance)
     condensed = sparse.condensed()
     given = _states(controller, condensed, states)
     loop = recording(controller, given, reference, steps)
@@ -145,9 +147,9 @@ def export_c(
         int(iterations.max()),
         unsolved,
     )
-    values = sizes(controller, precision, tol, max_iterations)
+    values = sizes(controller, precision, tol, max_iterations, disturbance)
     texts = {
-        "mpc_data.h": constants(controller, program, precision),
+        "mpc_data.h": constants(controller, program, precision, disturbance),
         "loop.h": loop.text(controller, reference, max(1e-6, 1e3 * tol)),
         "README.md": told(done, values, len(given)),
         **{name: filled(name, values) for name in ("mpc.h", "mpc.c", "main.c", "Makefile")},
@@ -271,7 +273,8 @@ def _penalty(
             p = np.zeros(program.F.shape[1])
             p[: len(x)] = x
             if reference is not None:
-                p[len(x) :] = np.concatenate([reference.x, reference.u])
+                held = np.concatenate([reference.x, reference.u])
+                p[len(x) : len(x) + len(held)] = held
             q, lower, upper = program.at(p)
             solver.update(q=q, l=np.clip(lower, -1e30, 1e30), u=np.clip(upper, -1e30, 1e30))
             solver.warm_start(x=np.zeros(len(q)), y=np.zeros(len(lower)))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -16,6 +17,7 @@ from prefmpc.mpc._cone import PROVEN, SOLVED, TIGHT, ConeProgram, ConeSolution
 from prefmpc.mpc._options import OptionProgram, Options
 from prefmpc.mpc._refine import Refiner
 from prefmpc.mpc._stages import Bounds, StageProgram, pushed_states
+from prefmpc.mpc._stored import restored, stored
 from prefmpc.mpc._turns import Turns
 from prefmpc.mpc.solution import (
     Controller,
@@ -46,6 +48,9 @@ _SETTINGS = {
 
 GOOD = 1e-9
 """A residual with which nobody needs to try for a better one."""
+
+RESTORED = ("constraints", "terminal", "soft", "soft_quadratic", "max_increment", "blocks")
+"""What a stored controller may have or not."""
 
 KEPT = 1e-9
 """A soft row is kept to within this share of the size of its terms."""
@@ -127,6 +132,24 @@ class LinearMPC(Turns, Controller):
         super().__init__()
         self._backup: ConeProgram | None = None
         self._refine: Refiner | None = None
+
+    def to_json(self) -> str:
+        """Return the controller as JSON, see `from_json`; infinite numbers are null there."""
+        rest: dict[str, Any] = {"horizon": self.horizon}
+        rest |= {"constraints": self._constraints, "terminal": self._terminal}
+        if (options := self._options) is not None:
+            rest |= {"soft": options.soft, "max_increment": options.increment}
+            rest["soft_quadratic"] = 0.0 if options.curved is None else options.curved
+            rest["blocks"] = np.diff(np.flatnonzero(np.append(~options.same, True))).tolist()
+        return stored(self.system, self.cost, rest)
+
+    @classmethod
+    def from_json(cls, text: str) -> LinearMPC:
+        """Return the controller that `to_json` wrote. A ValueError names the field that is wrong.
+
+        Nothing but numbers is read: no code can come in this way.
+        """
+        return cls(**restored(text, RESTORED))
 
     def reset(self) -> None:
         """Forget the last input, where increments are limited."""

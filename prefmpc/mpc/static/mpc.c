@@ -216,6 +216,11 @@ mpc_status mpc_step(const mpc_float *x, mpc_float *u)
         mpc_float value = product(&data_from_plan, i, found->x) + product(&data_from_state, i, p);
         u[i] = value < data_u_min[i] ? data_u_min[i] : value > data_u_max[i] ? data_u_max[i] : value;
     }
+#if MPC_HAS_BEFORE
+    for (i = 0; i < MPC_NU; i++) {
+        p[DATA_BEFORE + i] = u[i];
+    }
+#endif
     return ended(MPC_SOLVED);
 }
 
@@ -238,7 +243,12 @@ mpc_status mpc_reference(const mpc_float *x_r, const mpc_float *u_r)
     }
     for (i = 0; i < MPC_NX; i++) { /* the next state is the same */
         mpc_float near = larger(far * data_units[i], sizes(&data_drift, i, z));
-        if (!(size_of(product(&data_drift, i, z)) <= DATA_REACHED * near)) {
+        mpc_float drift = product(&data_drift, i, z);
+#if MPC_HAS_DISTURBANCE
+        drift += p[DATA_DISTURBANCE + i];
+        near = larger(near, size_of(p[DATA_DISTURBANCE + i]));
+#endif
+        if (!(size_of(drift) <= DATA_REACHED * near)) {
             return MPC_BAD_INPUT;
         }
     }
@@ -253,6 +263,28 @@ mpc_status mpc_reference(const mpc_float *x_r, const mpc_float *u_r)
     }
     return MPC_SOLVED;
 }
+#endif
+
+#if MPC_HAS_DISTURBANCE || MPC_HAS_BEFORE
+static mpc_status taken(const mpc_float *values, int first, int count)
+{
+    int i;
+    if (!finite(values, count)) {
+        return MPC_BAD_INPUT;
+    }
+    for (i = 0; i < count; i++) {
+        p[first + i] = values[i];
+    }
+    return MPC_SOLVED;
+}
+#endif
+
+#if MPC_HAS_DISTURBANCE
+mpc_status mpc_disturbance(const mpc_float *d) { return taken(d, DATA_DISTURBANCE, MPC_NX); }
+#endif
+
+#if MPC_HAS_BEFORE
+mpc_status mpc_before(const mpc_float *u) { return taken(u, DATA_BEFORE, MPC_NU); }
 #endif
 
 mpc_status mpc_last_status(void) { return status; }

@@ -17,6 +17,8 @@ extern "C" {
 #define MPC_LARGEST_ITERATIONS @ITERATIONS@ /* a step never takes more */
 #define MPC_TOLERANCE @TOLERANCE@         /* "solved" is said of a residual up to this */
 @HAS_REFERENCE@
+@HAS_DISTURBANCE@
+@HAS_BEFORE@
 typedef @FLOAT@ mpc_float;
 
 typedef enum {
@@ -47,6 +49,18 @@ mpc_status mpc_step(const mpc_float *x, mpc_float *u) MPC_LOOK_AT_IT;
 /* From the next step on, steer to x_r (MPC_NX), u_r (MPC_NU), which must be a steady state within the
  * constraints: MPC_BAD_INPUT if it is not, and the old one stays. */
 mpc_status mpc_reference(const mpc_float *x_r, const mpc_float *u_r) MPC_LOOK_AT_IT;
+#endif
+
+#if MPC_HAS_DISTURBANCE
+/* From the next step on, d (MPC_NX) is added to every next state. A set point is steady under the
+ * disturbance at hand: set that first. */
+mpc_status mpc_disturbance(const mpc_float *d) MPC_LOOK_AT_IT;
+#endif
+
+#if MPC_HAS_BEFORE
+/* The plant received u (MPC_NU), and not what mpc_step found: increments are counted from there. At
+ * first, and after mpc_init, from 0. */
+mpc_status mpc_before(const mpc_float *u) MPC_LOOK_AT_IT;
 #endif
 
 /* Of the last step: the status, the iterations, and how far from optimal the plan is. */
