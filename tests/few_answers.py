@@ -5,7 +5,7 @@ from __future__ import annotations
 import cvxpy as cp
 import numpy as np
 
-from prefmpc import Answers, Comparisons, Recordings, Trajectory
+from prefmpc import Answers, Recordings, Trajectory
 
 
 def pool_of(rng, count=8, nx=2, nu=1):
@@ -30,7 +30,12 @@ def some_answers(seed, per_kind=6):
             Answers(pool, np.stack([first, second], 1), np.full(n, 2), rng.uniform(size=n)),
             Answers.from_labels(pool, first, second, list(ties), coding="words"),
             Answers.from_labels(
-                pool, first, second, list(rng.choice(list(strengths), n)), coding=strengths, grades=5
+                pool,
+                first,
+                second,
+                list(rng.choice(list(strengths), n)),
+                coding=strengths,
+                grades=5,
             ),
             Answers.from_labels(
                 pool, first, second, list(rng.integers(0, 4, n)), coding=four, grades=4
@@ -85,19 +90,34 @@ def minus_log_likelihood(answers, sigma, t, log_sum_exp):
     return total
 
 
-def in_cvxpy(answers, prior, spread, diagonal=False):
-    """Return minimum, Q, R and thresholds by Clarabel's exponential cones."""
-    T = answers.trajectories
-    x = [np.asarray(T[i].x[:-1]) for i in range(len(T))]
-    u = [np.asarray(T[i].u) for i in range(len(T))]
-    nx, nu = len(prior.Q), len(prior.R)
-    Q = cp.diag(cp.Variable(nx)) if diagonal else cp.Variable((nx, nx), symmetric=True)
-    R = cp.diag(cp.Variable(nu)) if diagonal else cp.Variable((nu, nu), symmetric=True)
-    sigma = [
-        cp.trace((a.T @ a) @ Q) + cp.trace((b.T @ b) @ R) for a, b in zip(x, u, strict=True)
+SIZES = {"acceptable": 1, "tie": 1, "4 grades": 1, "5 grades": 2, "5 stars": 4}
+
+
+def minus_log_prior(Q, R, t, prior, spread):
+    """By the formula, with NumPy."""
+    value = sum(float(np.sum(part**2)) for part in t.values()) / (2 * spread**2)
+    for W, W0 in ((Q, prior.Q), (R, prior.R)):
+        value += prior.strength * (np.trace(np.linalg.solve(W0, W)) - np.linalg.slogdet(W)[1])
+    return value
+
+
+def costs(T, Q, R):
+    """Return σ of every recording, step by step."""
+    runs = [T[i] for i in range(len(T))]
+    return [
+        float(sum(x @ Q @ x for x in run.x[:-1]) + sum(u @ R @ u for u in run.u)) for run in runs
     ]
-    sizes = {"acceptable": 1, "tie": 1, "4 grades": 1, "5 grades": 2, "5 stars": 4}
-    t = {name: cp.Variable(size) for name, size in sizes.items()}
+
+
+def in_cvxpy(answers, prior, spread):
+    """Return the least −log posterior, Q, R and thresholds, by Clarabel's exponential cones."""
+    runs = [answers.trajectories[i] for i in range(len(answers.trajectories))]
+    nx, nu = len(prior.Q), len(prior.R)
+    Q, R = cp.Variable((nx, nx), symmetric=True), cp.Variable((nu, nu), symmetric=True)
+    t = {name: cp.Variable(size) for name, size in SIZES.items()}
+    Sx = np.stack([(run.x[:-1].T @ run.x[:-1]).ravel() for run in runs])
+    Su = np.stack([(run.u.T @ run.u).ravel() for run in runs])
+    sigma = Sx @ cp.vec(Q, order="C") + Su @ cp.vec(R, order="C")
     cost = minus_log_likelihood(
         answers, sigma, t, lambda parts: cp.log_sum_exp(cp.hstack([cp.sum(p) for p in parts]))
     )

@@ -109,7 +109,7 @@ def grade_of(i: int, label: Any, coding: Coding, marks: int) -> float:
     return (label / most + 1) / 2
 
 
-def items_of(name: str, value: Sequence[int]) -> list[int]:
+def items_of(name: str, value: Any) -> list[int]:
     """Return indices of different trajectories as a list, or raise a ValueError."""
     items = sequence(name, value)
     if not items or not all(map(is_whole, items)):
