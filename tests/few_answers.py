@@ -93,14 +93,6 @@ def minus_log_likelihood(answers, sigma, t, log_sum_exp):
 SIZES = {"acceptable": 1, "tie": 1, "4 grades": 1, "5 grades": 2, "5 stars": 4}
 
 
-def minus_log_prior(Q, R, t, prior, spread):
-    """By the formula, with NumPy."""
-    value = sum(float(np.sum(part**2)) for part in t.values()) / (2 * spread**2)
-    for W, W0 in ((Q, prior.Q), (R, prior.R)):
-        value += prior.strength * (np.trace(np.linalg.solve(W0, W)) - np.linalg.slogdet(W)[1])
-    return value
-
-
 def costs(T, Q, R):
     """Return σ of every recording, step by step."""
     runs = [T[i] for i in range(len(T))]

@@ -8,7 +8,7 @@ import warnings
 import jax
 import numpy as np
 import pytest
-from few_answers import SIZES, costs, in_cvxpy, minus_log_likelihood, minus_log_prior, some_answers
+from few_answers import SIZES, costs, in_cvxpy, minus_log_likelihood, some_answers
 from few_comparisons import FEW, POOL, Distance
 from scipy.optimize import minimize
 from scipy.special import expit, logsumexp
@@ -46,6 +46,12 @@ def by_formula(answers, Q, R, t):
 def drawn(seed=0):
     rng = np.random.default_rng(seed)
     return {name: rng.normal(size=size) for name, size in SIZES.items()}
+
+
+def plain_log_sum_exp(parts):
+    """Of complex numbers too."""
+    most = max(np.real(part) for part in parts)
+    return most + np.log(sum(np.exp(part - most) for part in parts))
 
 
 def in_order(thresholds, t):
@@ -160,18 +166,19 @@ def test_a_diagonal_minimum_is_that_of_scipy(seed):
         [[*(run.x[:-1] ** 2).sum(0), *(run.u**2).sum(0)] for run in map(T.__getitem__, range(8))]
     )
 
-    def unpacked(v):
-        ends = np.cumsum([3, *SIZES.values()])
-        t = {name: v[a:b] for name, a, b in zip(SIZES, ends, ends[1:], strict=False)}
-        return np.exp(v[:3]), t
-
     def cost(v):
-        w, t = unpacked(v)
-        value = minus_log_likelihood(answers, squares @ w, t, logsumexp)
-        return value + minus_log_prior(np.diag(w[:2]), np.diag(w[2:]), t, prior, spread)
+        w, ends = np.exp(v[:3]), np.cumsum([3, *SIZES.values()])
+        t = {name: v[a:b] for name, a, b in zip(SIZES, ends, ends[1:], strict=False)}
+        value = minus_log_likelihood(answers, squares @ w, t, plain_log_sum_exp)
+        prior_value = 1.5 * np.sum(w / [1, 0.8, 2] - np.log(w))
+        return value + prior_value + np.sum(v[3:] ** 2) / (2 * spread**2)
+
+    def slope(v):  # exact: no difference is taken
+        return np.array([cost(v + 1e-30j * e).imag / 1e-30 for e in np.eye(12)])
 
     start = np.concatenate([np.log([1, 0.8, 2]), np.zeros(9)])
-    found = minimize(cost, start, method="L-BFGS-B", options={"ftol": 1e-13, "maxfun": 10**5})
+    options = {"ftol": 1e-14, "gtol": 1e-8, "maxfun": 10**5}
+    found = minimize(lambda v: cost(v).real, start, jac=slope, method="L-BFGS-B", options=options)
     assert found.fun == pytest.approx(result.objective, rel=1e-7)
 
 
@@ -242,13 +249,19 @@ def item_data(kind, seed=5):
 @pytest.mark.parametrize("kind", ["pairs", "rankings", "top"])
 def test_items_are_as_strong_as_scipy_finds_them(kind):
     data = item_data(kind)
+    count = np.minimum(data.answers, data.sizes - 1).sum()
 
     def cost(theta):
-        return minus_log_likelihood(data, theta, {}, logsumexp) / int(
-            np.minimum(data.answers, data.sizes - 1).sum()
-        ) + 1e-6 * float(theta @ theta)
+        return (
+            minus_log_likelihood(data, theta, {}, plain_log_sum_exp) / count + 1e-6 * theta @ theta
+        )
 
-    found = minimize(cost, np.zeros(6), method="BFGS", options={"gtol": 1e-9})
+    def slope(theta):
+        return np.array([cost(theta + 1e-30j * e).imag / 1e-30 for e in np.eye(6)])
+
+    found = minimize(
+        lambda v: cost(v).real, np.zeros(6), jac=slope, method="BFGS", options={"gtol": 1e-9}
+    )
     result = fit(
         data, ItemCost(np.zeros((1, 6))), key=0, selection="training_loss", l2=1e-6, tol=1e-9
     )
@@ -262,12 +275,7 @@ def test_recordings_of_one_length_are_a_batch_and_others_as_if_padded():
     listed = Recordings([POOL[i] for i in range(5)])
     mean = Recordings([POOL], per_step=True)
     one = fit_map(even, PRIOR)
-    two = fit_map(
-        dataclasses.replace(even)
-        if False
-        else Answers(listed, even.shown, even.grades, even.answers),
-        PRIOR,
-    )
+    two = fit_map(Answers(listed, even.shown, even.grades, even.answers), PRIOR)
     np.testing.assert_allclose(two.Q, one.Q, rtol=1e-12)
     per_step = fit_map(Answers(mean, even.shown, even.grades, even.answers), PRIOR)
     scaled = Trajectory(POOL.x / np.sqrt(3), POOL.u / np.sqrt(3))
