@@ -201,7 +201,12 @@ None, prior | Interview: prior
 digits, text | title
 None, digits, text | draw
 None | Interview.to_html: names, Interview.to_html: units, ask: names, ask: units
-True | Interview.to_html: overwrite
+True | Interview.to_html: overwrite, per_step
+one more | Recordings: trajectories
+one 9, None | grades
+set | Answers.from_labels: labels
+longer, wider, None | Answers.from_ratings: index
+None | Answers.from_rankings: shown
 """
 """What is right after all | for which argument of all calls, or of one call, which goes before."""
 

@@ -165,7 +165,10 @@ WITH_OUTPUT = Trajectory(np.ones((4, 2)), np.ones((3, 1)), np.ones((3, 1)))
             lambda: Answers.from_choices(POOL, [[0, 1]], [2]),
             r"chosen\[0\] must be among those shown, got 2",
         ),
-        (lambda: Answers.from_choices(POOL, [[0, 1]], [0, 1]), "chosen must hold 1"),
+        (
+            lambda: Answers.from_choices(POOL, [[0, 1]], [0, 1]),
+            "shown and chosen must be equally many, got 1 and 2",
+        ),
         (
             lambda: Answers.from_ratings(POOL, [1, 6], stars=5),
             "ratings must lie in 1 to 5 stars, got 6 at index 1",

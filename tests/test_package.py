@@ -19,7 +19,7 @@ import pytest
 
 import prefmpc
 
-LINES, CODE = 15_200, 10_000
+LINES, CODE = 16_800, 11_000
 """The library has at most so many lines, and so many without docstrings, comments and blanks."""
 
 FILE, FUNCTION, HOUR = 350, 60, 3_500

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, indices, instance, positive_int, sequence
+from prefmpc._checks import finite_array, indices, instance, is_whole, positive_int, sequence
 from prefmpc._pytree import register_pytree, set_fields
 from prefmpc.preferences.answer_files import read_lines, write_lines
 from prefmpc.preferences.codings import (
@@ -273,9 +273,11 @@ class Answers:
         best = [[item] for item in sequence("chosen", chosen)]
         sets = sequence("shown", shown)
         if len(best) != len(sets):
-            raise ValueError(f"chosen must hold {len(sets)} trajectories, got {len(best)}")
+            raise ValueError(
+                f"shown and chosen must be equally many, got {len(sets)} and {len(best)}"
+            )
         for i, (one, all_of) in enumerate(zip(best, sets, strict=True)):
-            if one[0] not in sequence(f"shown[{i}]", all_of):
+            if not is_whole(one[0]) or one[0] not in sequence(f"shown[{i}]", all_of):
                 raise ValueError(f"chosen[{i}] must be among those shown, got {one[0]!r}")
         return cls.from_rankings(trajectories, best, shown=sets)
 

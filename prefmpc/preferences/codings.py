@@ -86,7 +86,9 @@ def grade_of(i: int, label: Any, coding: Coding, marks: int) -> float:
         except TypeError:
             known = False
         if not known:
-            raise ValueError(f"labels[{i}] must be one of {list(coding)}, got {label!r}")
+            raise ValueError(
+                f"labels[{i}] must be one of those of coding, {list(coding)}, got {label!r}"
+            )
         grade = number(f"coding[{label!r}]", coding[label])
         if not 0 <= grade <= 1:
             raise ValueError(f"coding must give grades in [0, 1], got {grade} for {label!r}")
