@@ -110,7 +110,7 @@ class Answers:
     def check_same_start(self) -> Answers:
         """Return these answers if whatever was shown together starts alike and lasts equally long.
 
-        Else nothing but the control differs no longer; a ValueError names the first such answer.
+        Otherwise more differs than the control: a ValueError names the first such answer.
         """
         T = self.trajectories
         parts = T.parts if isinstance(T, Recordings) else (T,)
