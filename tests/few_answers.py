@@ -90,17 +90,26 @@ def minus_log_likelihood(answers, sigma, t, log_sum_exp):
     return total
 
 
-def in_cvxpy(answers, prior, spread, diagonal=False):
-    """Return minimum, Q, R and thresholds by Clarabel's exponential cones."""
-    T = answers.trajectories
-    x = [np.asarray(T[i].x[:-1]) for i in range(len(T))]
-    u = [np.asarray(T[i].u) for i in range(len(T))]
+SIZES = {"acceptable": 1, "tie": 1, "4 grades": 1, "5 grades": 2, "5 stars": 4}
+
+
+def costs(T, Q, R):
+    """Return σ of every recording, step by step."""
+    runs = [T[i] for i in range(len(T))]
+    return [
+        float(sum(x @ Q @ x for x in run.x[:-1]) + sum(u @ R @ u for u in run.u)) for run in runs
+    ]
+
+
+def in_cvxpy(answers, prior, spread):
+    """Return the least −log posterior, Q, R and thresholds, by Clarabel's exponential cones."""
+    runs = [answers.trajectories[i] for i in range(len(answers.trajectories))]
     nx, nu = len(prior.Q), len(prior.R)
-    Q = cp.diag(cp.Variable(nx)) if diagonal else cp.Variable((nx, nx), symmetric=True)
-    R = cp.diag(cp.Variable(nu)) if diagonal else cp.Variable((nu, nu), symmetric=True)
-    sigma = [cp.trace((a.T @ a) @ Q) + cp.trace((b.T @ b) @ R) for a, b in zip(x, u, strict=True)]
-    sizes = {"acceptable": 1, "tie": 1, "4 grades": 1, "5 grades": 2, "5 stars": 4}
-    t = {name: cp.Variable(size) for name, size in sizes.items()}
+    Q, R = cp.Variable((nx, nx), symmetric=True), cp.Variable((nu, nu), symmetric=True)
+    t = {name: cp.Variable(size) for name, size in SIZES.items()}
+    Sx = np.stack([(run.x[:-1].T @ run.x[:-1]).ravel() for run in runs])
+    Su = np.stack([(run.u.T @ run.u).ravel() for run in runs])
+    sigma = Sx @ cp.vec(Q, order="C") + Su @ cp.vec(R, order="C")
     cost = minus_log_likelihood(
         answers, sigma, t, lambda parts: cp.log_sum_exp(cp.hstack([cp.sum(p) for p in parts]))
     )

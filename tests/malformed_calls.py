@@ -141,6 +141,28 @@ def valid_calls():
             p.Trajectory,
             {"x": np.ones((4, 2)), "u": np.ones((3, 1)), "y": np.ones((3, 2)), **deviations},
         ),
+        "Recordings": (p.Recordings, {"trajectories": [POOL, POOL], "per_step": False}),
+        "Answers": (
+            p.Answers,
+            {"trajectories": POOL, "shown": [[0, 1]], "grades": [3], "answers": [0.5]},
+        ),
+        "Answers.from_labels": (
+            p.Answers.from_labels,
+            {"trajectories": POOL, "first": [0], "second": [1], "labels": [1]}
+            | {"coding": "signs", "grades": 3},
+        ),
+        "Answers.from_ratings": (
+            p.Answers.from_ratings,
+            {"trajectories": POOL, "ratings": [2, 3], "stars": 5, "index": [0, 1]},
+        ),
+        "Answers.from_rankings": (
+            p.Answers.from_rankings,
+            {"trajectories": POOL, "rankings": [[0, 1]], "shown": [[0, 1, 2]]},
+        ),
+        "Answers.from_choices": (
+            p.Answers.from_choices,
+            {"trajectories": POOL, "shown": [[0, 1, 2]], "chosen": [0]},
+        ),
         "second_moments": (p.second_moments, {"trajectory": POOL}),
         "phi": (p.phi, {"trajectory": POOL, "Q": np.eye(2), "R": np.eye(1)}),
         "max_input": (p.max_input, {"trajectory": POOL}),

@@ -211,6 +211,12 @@ None, negative, with 1e308 | OutputFeedback: y_r, y_r
 None, longer, negative | states
 None, trajectory | LinearMPC.solve: reference
 None, negative | disturbance
+True | Interview.to_html: overwrite, per_step
+one more | Recordings: trajectories
+one 9, None | grades
+set | Answers.from_labels: labels
+longer, wider, None | Answers.from_ratings: index
+None | Answers.from_rankings: shown
 """
 """What is right after all | for which argument of all calls, or of one call, which goes before."""
 

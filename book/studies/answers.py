@@ -69,13 +69,12 @@ def collected(person: Person, pool: Trajectory, count: int, rng: np.random.Gener
     shown = rng.integers(0, n, count)
     marks = np.quantile(heard(rng.integers(0, n, 4000)), [0.2, 0.4, 0.6, 0.8])
     stars = 5 - np.searchsorted(marks, heard(shown))
-    signs = {"coding": "signs"}
     return {
         "forced choice": Comparisons(*sides, (gap > 0).astype(float)),
         "ties dropped": Comparisons(*sides, ties).subset(clear),
         "ties as halves": Comparisons(*sides, ties),
-        "ties": Answers.from_labels(*sides, np.sign(strength), **signs),
-        "strengths": Answers.from_labels(*sides, strength, **signs, grades=5),
+        "ties": Answers.from_labels(*sides, np.sign(strength), coding="signs"),
+        "strengths": Answers.from_labels(*sides, strength, coding="signs", grades=5),
         "best of five": Answers.from_choices(pool, fives, orders[:, 0]),
         "ranking of five": Answers.from_rankings(pool, orders),
         "five stars": Answers.from_ratings(pool, stars, stars=5, index=shown),

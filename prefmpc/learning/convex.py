@@ -113,7 +113,7 @@ class MapResult(Result):
 
     @property
     def thresholds(self) -> dict[str, np.ndarray]:
-        """What was learned beside σ from `Answers`, in log-odds, by name; see `fit_map`."""
+        """What was learned beside σ from `Answers`, by name: see `fit_map`."""
         self.check()
         return self.problem.thresholds.named(self.minimum.thresholds)
 
@@ -173,8 +173,7 @@ class MapResult(Result):
         Returns
         -------
         Interval
-            Three arrays (...). The mean, of a logistic function of a Gaussian, is that of MacKay's
-            approximation.
+            Three arrays (...). The mean of a logistic function of a Gaussian is MacKay's.
         """
         self.check()
         reach = ndtri((1 + share("level", level)) / 2)
@@ -215,12 +214,9 @@ def fit_map(
     z_i = σ(second_i) − σ(first_i), eq. (4) of arXiv 2511.22502, over positive definite Q and R,
     by Newton's method with exact derivatives from the prior's mode.
 
-    Answers of other kinds are choices among alternatives whose utilities are linear in (Q, R) and
-    in a few thresholds, so that their −log likelihood is convex in all of them; these are learned
-    along, with a weak Gaussian prior. See `prefmpc.learning.choices` for each model, and
-    ``thresholds`` of the result: "tie" is Davidson's log ν, "acceptable" the σ at which yes and no
-    are equally probable, "5 stars" the same between neighbouring ones, "5 grades" what the inner
-    grades have more than the outermost, from outside to the middle.
+    `Answers` of every kind are choices with utilities linear in (Q, R) and in a few thresholds:
+    convex in all of them, and learned together (`prefmpc.learning.choices`). "tie" is Davidson's
+    log ν, "acceptable" or "5 stars" the σ between neighbours, "5 grades" the inner grades' excess.
 
     Parameters
     ----------
@@ -238,8 +234,7 @@ def fit_map(
     tol : float
         Stop when half the squared Newton decrement is below ``tol`` times 1 + abs(objective).
     mesh : jax.sharding.Mesh, optional
-        Devices to share Comparisons among; they may belong to several processes, which then all
-        make the same call.
+        Devices to share Comparisons among; all processes that own some make the same call.
 
     Returns
     -------
@@ -252,11 +247,11 @@ def fit_map(
     """
     check_data("comparisons", comparisons)
     instance("prior", prior, WishartPrior)
-    if mesh is not None and isinstance(comparisons, Answers):
-        raise ValueError("mesh must be None for Answers: it shares Comparisons only")
-    if weights is not None and isinstance(comparisons, Answers):
-        raise ValueError("weights must be None for Answers: those of Comparisons count as many")
-    mesh = None if mesh is None else check_mesh(mesh)
+    if mesh is not None:
+        mesh = check_mesh(mesh)
+        instance("comparisons, to be shared among devices,", comparisons, Comparisons)
+    if weights is not None:
+        instance("comparisons, to be weighed,", comparisons, Comparisons)
     counts = answer_weights(weights, len(comparisons))
     options = structure, outputs, max_iterations, tol, mesh, counts
     result = _solved([comparisons], [prior], *options)[0]

@@ -262,7 +262,9 @@ def _train(
             tol=tol,
         )
         outside = jax.tree.map(
-            lambda leaf, low, high: jnp.max(jnp.maximum(low - leaf, leaf - high)), model, *bounds
+            lambda leaf, low, high: jnp.max(jnp.maximum(low - leaf, leaf - high), initial=0.0),
+            model,
+            *bounds,
         )
         violation = jnp.maximum(jnp.max(jnp.stack(jax.tree.leaves(outside))), 0.0)
         # A maximum may pass over NaN.

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, indices, instance, positive_int, sequence
+from prefmpc._checks import finite_array, indices, instance, is_whole, positive_int, sequence
 from prefmpc._pytree import register_pytree, set_fields
 from prefmpc.preferences.answer_files import read_lines, write_lines
 from prefmpc.preferences.codings import (
@@ -110,7 +110,7 @@ class Answers:
     def check_same_start(self) -> Answers:
         """Return these answers if whatever was shown together starts alike and lasts equally long.
 
-        Else nothing but the control differs no longer; a ValueError names the first such answer.
+        Otherwise more differs than the control: a ValueError names the first such answer.
         """
         T = self.trajectories
         parts = T.parts if isinstance(T, Recordings) else (T,)
@@ -142,7 +142,7 @@ class Answers:
         trajectories: Pool,
         first: ArrayLike,
         second: ArrayLike,
-        labels: Sequence[Any],
+        labels: Sequence[Any] | np.ndarray,
         *,
         coding: Coding,
         grades: int | None = None,
@@ -219,9 +219,9 @@ class Answers:
     def from_rankings(
         cls,
         trajectories: Pool,
-        rankings: Sequence[Sequence[int]],
+        rankings: Sequence[Sequence[int]] | np.ndarray,
         *,
-        shown: Sequence[Sequence[int]] | None = None,
+        shown: Sequence[Sequence[int]] | np.ndarray | None = None,
     ) -> Answers:
         """Read rankings, best first, each a sequence of indices of trajectories.
 
@@ -255,7 +255,10 @@ class Answers:
 
     @classmethod
     def from_choices(
-        cls, trajectories: Pool, shown: Sequence[Sequence[int]], chosen: Sequence[int]
+        cls,
+        trajectories: Pool,
+        shown: Sequence[Sequence[int]] | np.ndarray,
+        chosen: Sequence[int] | np.ndarray,
     ) -> Answers:
         """Read which one of several was the best.
 
@@ -270,15 +273,17 @@ class Answers:
         best = [[item] for item in sequence("chosen", chosen)]
         sets = sequence("shown", shown)
         if len(best) != len(sets):
-            raise ValueError(f"chosen must hold {len(sets)} trajectories, got {len(best)}")
+            raise ValueError(
+                f"shown and chosen must be equally many, got {len(sets)} and {len(best)}"
+            )
         for i, (one, all_of) in enumerate(zip(best, sets, strict=True)):
-            if one[0] not in sequence(f"shown[{i}]", all_of):
+            if not is_whole(one[0]) or one[0] not in sequence(f"shown[{i}]", all_of):
                 raise ValueError(f"chosen[{i}] must be among those shown, got {one[0]!r}")
         return cls.from_rankings(trajectories, best, shown=sets)
 
     @classmethod
     def concatenate(cls, sets: Sequence[Answers | Comparisons]) -> Answers:
-        """Put data sets together, one after the other, each about its own trajectories.
+        """Put data sets together, one after the other; a pool that they share stays one.
 
         Where these last differently long, they become `Recordings`. A ValueError says what does
         not fit: numbers of states, inputs or outputs, set points.
@@ -286,8 +291,7 @@ class Answers:
         given = [as_answers(f"sets[{i}]", one) for i, one in enumerate(sequence("sets", sets))]
         if not given:
             raise ValueError("sets must hold at least one data set, got none")
-        pools = [one.trajectories for one in given]
-        offsets = np.cumsum([0, *map(len, pools)])
+        pool, offsets = joined([one.trajectories for one in given])
         width = max(one.shown.shape[1] for one in given)
         rows = [
             np.pad(
@@ -295,12 +299,12 @@ class Answers:
                 ((0, 0), (0, width - one.shown.shape[1])),
                 constant_values=NOBODY,
             )
-            for one, offset in zip(given, offsets[:-1], strict=True)
+            for one, offset in zip(given, offsets, strict=True)
         ]
         parts = [
             np.concatenate([getattr(one, name) for one in given]) for name in ("grades", "answers")
         ]
-        return cls(joined(pools), np.concatenate(rows), *parts)
+        return cls(pool, np.concatenate(rows), *parts)
 
     def save(self, path: str | os.PathLike[str], *, overwrite: bool = False) -> Path:
         """Write a ``.jsonl`` file: a line for each trajectory, then one for each answer.

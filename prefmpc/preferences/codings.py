@@ -86,7 +86,9 @@ def grade_of(i: int, label: Any, coding: Coding, marks: int) -> float:
         except TypeError:
             known = False
         if not known:
-            raise ValueError(f"labels[{i}] must be one of {list(coding)}, got {label!r}")
+            raise ValueError(
+                f"labels[{i}] must be one of those of coding, {list(coding)}, got {label!r}"
+            )
         grade = number(f"coding[{label!r}]", coding[label])
         if not 0 <= grade <= 1:
             raise ValueError(f"coding must give grades in [0, 1], got {grade} for {label!r}")
@@ -109,7 +111,7 @@ def grade_of(i: int, label: Any, coding: Coding, marks: int) -> float:
     return (label / most + 1) / 2
 
 
-def items_of(name: str, value: Sequence[int]) -> list[int]:
+def items_of(name: str, value: Any) -> list[int]:
     """Return indices of different trajectories as a list, or raise a ValueError."""
     items = sequence(name, value)
     if not items or not all(map(is_whole, items)):

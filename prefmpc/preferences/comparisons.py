@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,13 +12,14 @@ import jax
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import finite_array, flag, function, indices, positive_int
+from prefmpc._checks import finite_array, flag, function, indices, instances, positive_int
 from prefmpc._files import atomic_write
 from prefmpc._pytree import set_fields, stacked
 from prefmpc._random import generator
 from prefmpc.preferences.logs import answers_of, read
 from prefmpc.preferences.names import names_of
 from prefmpc.preferences.people import Preference, asked
+from prefmpc.preferences.recordings import joined
 from prefmpc.preferences.trajectories import Trajectory, check_finite
 
 _OPTIONAL = dict.fromkeys(("x_r", "u_r", "y_r", "u_before"), 2)
@@ -178,6 +180,27 @@ class Comparisons:
         both = jax.tree.map(lambda a, b: np.concatenate([a, b]), first, second)
         return cls(both, np.arange(n), np.arange(n, 2 * n), answers, who)
 
+    @classmethod
+    def concatenate(cls, sets: Sequence[Comparisons]) -> Comparisons:
+        """Put data sets together, one after the other; a pool that they share stays one.
+
+        A ValueError says what does not fit. `Answers.concatenate` takes any lengths, and answers
+        of other kinds.
+        """
+        given: list[Any] = instances("sets", sets, Comparisons)
+        trajectories, offsets = joined([one.trajectories for one in given])
+        if not isinstance(trajectories, Trajectory):
+            lengths = sorted({one.trajectories.horizon for one in given})
+            raise ValueError(
+                f"sets must be about equally long trajectories, got {lengths} steps; "
+                "Answers.concatenate takes recordings of different lengths"
+            )
+        first, second = (
+            np.concatenate([getattr(one, side) + k for one, k in zip(given, offsets, strict=True)])
+            for side in ("first", "second")
+        )
+        return cls(trajectories, first, second, np.concatenate([one.labels for one in given]))
+
     def subset(self, index: ArrayLike) -> Comparisons:
         """Return the comparisons chosen by an integer or boolean index, in that order."""
         chosen, n = indices("index", index), len(self)
@@ -282,7 +305,8 @@ def _recorded(side: str, x: ArrayLike, u: ArrayLike, y: ArrayLike | None) -> Tra
         return Trajectory(x, u, y)
     except ValueError as error:
         names = f"x_{side}, u_{side} and y_{side}"
-        raise ValueError(f"{names} do not fit: {error}") from None
+        uneven = "; Recordings and Answers take different lengths" * ("inhomog" in str(error))
+        raise ValueError(f"{names} do not fit: {error}{uneven}") from None
 
 
 def check_pool(trajectories: Any) -> None:

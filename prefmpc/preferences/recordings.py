@@ -114,19 +114,19 @@ class Recordings:
 register_pytree(Recordings, static=("per_step",))
 
 
-def _alike(i: int, one: Trajectory, model: Trajectory) -> None:
+def _alike(i: int, one: Trajectory, model: Trajectory, name_of: str = "trajectories") -> None:
     for name, what in (("x", "states"), ("u", "inputs"), ("y", "outputs")):
         got, wanted = (getattr(side, name).shape[-1] for side in (one, model))
         if got != wanted:
             note = " (outputs that are not given are the states)" if name == "y" else ""
             raise ValueError(
-                f"trajectories[{i}] must have {wanted} {what} as the first one, got {got}{note}"
+                f"{name_of}[{i}] must have {wanted} {what} as the first one, got {got}{note}"
             )
     for name in ("x_r", "u_r", "y_r", "u_before"):
         got, wanted = (getattr(side, name) is not None for side in (one, model))
         if got != wanted:
             have = "have" if wanted else "have no"
-            raise ValueError(f"trajectories[{i}] must {have} {name} as the first one")
+            raise ValueError(f"{name_of}[{i}] must {have} {name} as the first one")
 
 
 def batches(trajectories: Trajectory | Recordings) -> tuple[Trajectory, ...]:
@@ -141,21 +141,31 @@ def applied(measure: Callable[[Trajectory], Any], trajectories: Trajectory | Rec
     return measure(trajectories)
 
 
-def joined(pools: Sequence[Trajectory | Recordings]) -> Trajectory | Recordings:
-    """Return several pools as one: a Trajectory if all are, and last equally long."""
+def joined(pools: Sequence[Trajectory | Recordings]) -> tuple[Trajectory | Recordings, list[int]]:
+    """Return several pools as one, and where each begins; a pool that comes twice stays one.
+
+    A Trajectory if all are, and last equally long. A ValueError says what does not fit.
+    """
     flags = {isinstance(pool, Recordings) and pool.per_step for pool in pools}
     if len(flags) > 1:
         raise ValueError(
             "sets must all sum over steps or all take the mean, got per_step=True in some: "
             "make Recordings(..., per_step=True) of the others' trajectories"
         )
-    plain = [pool for pool in pools if isinstance(pool, Trajectory)]
-    if len(plain) == len(pools) and len({pool.horizon for pool in plain}) == 1:
-        for i, pool in enumerate(plain):
-            _alike(i, pool, plain[0])
-        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *plain)
+    once = list({id(pool): pool for pool in pools}.values())
+    begin = np.cumsum([0, *map(len, once)])
+    offsets = {id(pool): int(k) for pool, k in zip(once, begin, strict=False)}
+    places = [offsets[id(pool)] for pool in pools]
+    models = [batches(pool)[0] for pool in once]
+    for i, pool in enumerate(models):
+        _alike(i, pool, models[0], "sets")
+    if len(once) == 1:
+        return once[0], places
+    plain = [pool for pool in once if isinstance(pool, Trajectory)]
+    if len(plain) == len(once) and len({pool.horizon for pool in plain}) == 1:
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves), *plain), places
     each = [
         [pool] if isinstance(pool, Trajectory) else [pool[i] for i in range(len(pool))]
-        for pool in pools
+        for pool in once
     ]
-    return Recordings([one for pool in each for one in pool], per_step=flags.pop())
+    return Recordings([one for some in each for one in some], per_step=flags.pop()), places
