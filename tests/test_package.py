@@ -19,7 +19,7 @@ import pytest
 
 import prefmpc
 
-LINES, CODE = 15_200, 10_000
+LINES, CODE = 16_750, 10_900
 """The library has at most so many lines, and so many without docstrings, comments and blanks."""
 
 FILE, FUNCTION, HOUR = 350, 60, 3_500
@@ -270,6 +270,9 @@ def test_no_module_depends_on_itself():
 # These are made by the library, or hold no input of their own.
 MADE = {
     *(
+        "Agreement",
+        "Camps",
+        "ChangeTest",
         "ClosedLoops",
         "CostModel",
         "FitError",
@@ -281,9 +284,12 @@ MADE = {
         "MapResult",
         "Moments",
         "NetworkFit",
+        "PeoplePosterior",
+        "PeopleResult",
         "Posterior",
         "PriorChoice",
         "Question",
+        "Shared",
         "StabilityCheck",
         "SteadyState",
         "TerminalIngredients",
