@@ -52,7 +52,9 @@ def test_no_model_agrees_more_than_the_ceiling_says():
     best = np.mean(np.maximum(q, 1 - q))
     assert best < 0.5 + 0.5 * np.sqrt(2 * share - 1) < best + 0.05
     data = Comparisons(POOL, np.zeros(2, int), np.ones(2, int), [1, 1])
-    assert agreement(data).within.ceiling == 1.0
+    within = agreement(data).within
+    assert within.share == within.upper == within.ceiling == 1.0
+    assert 0.3 < within.lower < 1
 
 
 def test_without_repeated_questions_nothing_is_said():
