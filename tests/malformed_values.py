@@ -202,6 +202,10 @@ digits, text | title
 None, digits, text | draw
 None | Interview.to_html: names, Interview.to_html: units, ask: names, ask: units
 True | Interview.to_html: overwrite
+None, texts | who
+None, with 1e308 | fit_map: weights
+1.5, 10^30 | sharper, fit_hierarchy: apart, find_camps: odds, half_life
+0, 1.5, 10^30 | find_camps: apart
 """
 """What is right after all | for which argument of all calls, or of one call, which goes before."""
 

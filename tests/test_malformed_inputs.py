@@ -27,6 +27,7 @@ EXEMPT = {
     **dict.fromkeys(
         [
             *("ClosedLoops", "FitResult", "GlobalResult", "Interval", "MPCSolution", "Moments"),
+            *("Agreement", "Camps", "ChangeTest", "PeoplePosterior", "PeopleResult", "Shared"),
             *(
                 "NetworkFit",
                 "Posterior",
