@@ -39,6 +39,12 @@ from malformed_samples import (
 import prefmpc as p
 from prefmpc import plots
 
+NAMED = p.Comparisons(
+    *(vars(DATA)[name] for name in vars(DATA) if name != "who"), np.arange(len(DATA)) % 2
+)
+COUNTS = {"weights": np.ones(len(DATA))}
+PEOPLE = {"spread": 2.0, "sharpness": 2.0, "sharper": 1.0, "lapse": 0.1}
+
 
 def unlogged(**options):
     return p.Interview(**options)
@@ -80,6 +86,7 @@ def valid_calls():
     """Return name → (function, valid arguments)."""
     ingredients = p.terminal_ingredients(SYSTEM, COST)
     found = p.fit_map(DATA, PRIOR)
+    rated = p.fit_raters(NAMED, PRIOR)
     check = p.check_stability(SYSTEM, COST)
     target = p.steady_state(SYSTEM, [0.0, 0.0])
     nets = p.MLPCost.random([1.0, 1, 1], key=KEY, widths=(2,), shape=(2,))
@@ -224,7 +231,10 @@ def valid_calls():
         "one_by_one()": (p.one_by_one(PERSON), SIDES),
         "Comparisons": (
             p.Comparisons,
-            {"trajectories": POOL, "first": [0, 1], "second": [1, 2], "labels": np.ones(2)},
+            {
+                **{"trajectories": POOL, "first": [0, 1], "second": [1, 2], "labels": np.ones(2)},
+                "who": ["Ada", "Bob"],
+            },
         ),
         "Comparisons.random": (
             p.Comparisons.random,
@@ -239,7 +249,7 @@ def valid_calls():
                 **{"x_first": np.ones((2, 4, 2)), "u_first": np.ones((2, 3, 1))},
                 **{"x_second": np.ones((2, 4, 2)), "u_second": np.ones((2, 3, 1))},
                 **{"y_first": np.ones((2, 3, 2)), "y_second": np.ones((2, 3, 2))},
-                "labels": np.ones(2),
+                **{"labels": np.ones(2), "who": [1, 2]},
             },
         ),
         "Comparisons.sampled": (DATA.sampled, {"key": KEY}),
@@ -303,7 +313,7 @@ def valid_calls():
         ),
         "fit_map": (
             p.fit_map,
-            {"comparisons": DATA, "prior": PRIOR, **NEWTON, "mesh": None},
+            {"comparisons": DATA, "prior": PRIOR, **NEWTON, "mesh": None, **COUNTS},
         ),
         "fit_maps": (p.fit_maps, {"comparisons": DATA, "priors": [PRIOR, PRIOR], **NEWTON}),
         "fit_network": (
@@ -320,6 +330,33 @@ def valid_calls():
         "choose_prior": (
             p.choose_prior,
             {"comparisons": DATA, "priors": [PRIOR], "by": "evidence", "folds": 2, **SHARED},
+        ),
+        # several people
+        "fit_raters": (p.fit_raters, {"comparisons": NAMED, "prior": PRIOR, **PEOPLE, **COUNTS}),
+        "fit_hierarchy": (
+            p.fit_hierarchy,
+            {"comparisons": NAMED, "prior": PRIOR, "apart": 0.5, **PEOPLE, **COUNTS},
+        ),
+        "PeopleResult.newcomer": (rated.newcomer, {"comparisons": DATA}),
+        "PeopleResult.sharpness": (rated.sharpness, {"level": 0.9}),
+        "PeopleResult.lapses": (rated.lapses, {"level": 0.9}),
+        "PeopleResult.relative": (rated.relative, {"level": 0.9}),
+        "people_posterior": (p.people_posterior, {"result": rated, "draws": 256, "key": 0}),
+        "find_camps": (
+            p.find_camps,
+            {
+                **{"comparisons": NAMED, "prior": PRIOR, "most": 1, "odds": 20.0, "starts": 1},
+                **{"key": KEY, "apart": 0.0, **PEOPLE, **COUNTS},
+            },
+        ),
+        "agreement": (p.agreement, {"comparisons": NAMED, "level": 0.9}),
+        "forgetting": (p.forgetting, {"n": 3, "half_life": 2.0}),
+        "has_changed": (
+            p.has_changed,
+            {
+                **{"comparisons": NAMED, "prior": PRIOR, "split": 0.5, "simulations": 1},
+                **{"key": KEY, **PEOPLE},
+            },
         ),
         # asking
         "Interview": (

@@ -217,6 +217,10 @@ one 9, None | grades
 set | Answers.from_labels: labels
 longer, wider, None | Answers.from_ratings: index
 None | Answers.from_rankings: shown
+None, texts | who
+None, with 1e308 | fit_map: weights
+1.5, 10^30 | sharper, fit_hierarchy: apart, find_camps: odds, half_life
+0, 1.5, 10^30 | find_camps: apart
 """
 """What is right after all | for which argument of all calls, or of one call, which goes before."""
 

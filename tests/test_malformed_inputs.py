@@ -26,15 +26,9 @@ EXEMPT = {
     **dict.fromkeys(["FitError", "MPCError"], "an error"),
     **dict.fromkeys(
         [
-            *(
-                "CExport",
-                "ClosedLoops",
-                "FitResult",
-                "GlobalResult",
-                "Interval",
-                "MPCSolution",
-                "Moments",
-            ),
+            *("CExport", "ClosedLoops", "FitResult", "GlobalResult", "Interval", "MPCSolution"),
+            *("Agreement", "Camps", "ChangeTest", "Moments", "PeoplePosterior", "PeopleResult"),
+            "Shared",
             *(
                 "NetworkFit",
                 "Posterior",

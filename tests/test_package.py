@@ -19,7 +19,7 @@ import pytest
 
 import prefmpc
 
-LINES, CODE = 16_800, 11_200
+LINES, CODE = 18_800, 12_600
 """The library has at most so many lines, and so many without docstrings, comments and blanks."""
 
 FILE, FUNCTION, HOUR = 350, 60, 3_500
@@ -271,7 +271,10 @@ def test_no_module_depends_on_itself():
 # These are made by the library, or hold no input of their own.
 MADE = {
     *(
+        "Agreement",
         "CExport",
+        "Camps",
+        "ChangeTest",
         "ClosedLoops",
         "CostModel",
         "FitError",
@@ -283,9 +286,12 @@ MADE = {
         "MapResult",
         "Moments",
         "NetworkFit",
+        "PeoplePosterior",
+        "PeopleResult",
         "Posterior",
         "PriorChoice",
         "Question",
+        "Shared",
         "StabilityCheck",
         "SteadyState",
         "TerminalIngredients",

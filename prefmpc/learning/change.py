@@ -65,7 +65,7 @@ def agreement(comparisons: Comparisons, *, level: float = 0.9) -> Agreement:
         Without ``who``, all answers are one person's.
     level : float
         Of the intervals, which are Jeffreys' with as many draws as there are questions: they are
-        for other questions to the same people.
+        for other questions to the same people. Where all (or none) are equal, one bound is 1 (0).
 
     Returns
     -------
@@ -116,6 +116,7 @@ def _shared(pairs: np.ndarray, level: float) -> Shared:
     A = float(equal.sum() / count.sum())
     tails = np.array([(1 - level) / 2, (1 + level) / 2])
     lower, upper = betaincinv(n * A + 0.5, n * (1 - A) + 0.5, tails).tolist()
+    lower, upper = (0.0 if A == 0 else lower), (1.0 if A == 1 else upper)
     ceilings = (0.5 + 0.5 * np.sqrt(np.maximum(2 * np.array([A, lower, upper]) - 1, 0))).tolist()
     return Shared(A, lower, upper, n, *ceilings)
 

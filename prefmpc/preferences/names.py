@@ -23,7 +23,10 @@ def names_of(who: Any, size: int) -> np.ndarray | None:
     """
     if who is None:
         return None
-    entries = [getattr(e, "item", lambda e=e: e)() for e in sequence("who", who)]
+    try:
+        entries = [getattr(e, "item", lambda e=e: e)() for e in sequence("who", who)]
+    except (TypeError, NotImplementedError) as error:  # of arrays of something else
+        raise ValueError(f"who must hold whole numbers, or texts: {error}") from None
     if len(entries) != size:
         raise ValueError(f"who must name {size} people, one for each label, got {len(entries)}")
     texts = [isinstance(entry, str) and bool(entry.strip()) for entry in entries]
