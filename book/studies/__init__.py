@@ -5,8 +5,9 @@ results that the book reads. NAME is "quadratic" and "distinct" (case study 1), 
 "ties" (case study 2), "measures" (what accuracy does not tell), "priors" and "calibration" (what a
 prior is worth), "onesided" (a person whom no quadratic represents), "references" (many set
 points), "signals" (what σ may see), "lane" (a car and its passenger), "stability",
-"answers" (ties, strengths and rankings beside pairs), "asking" and "fewer" (strategies that choose the next question), "stopping", "limits" or "settled"
-(when to stop asking, and when choosing fails), "people" (several, and such as change).
+"answers" (ties, strengths and rankings beside pairs), "people" (several, and such as change),
+"asking" and "fewer" (strategies that choose the next question), "stopping", "limits" or "settled"
+(when to stop asking, and when choosing fails).
 """
 
 from studies.measures import baselines, measures_case

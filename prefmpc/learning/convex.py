@@ -20,7 +20,6 @@ from scipy.special import expit, ndtri
 
 from prefmpc._checks import (
     instance,
-    instances,
     nonnegative,
     positive_int,
     require_x64,
@@ -31,7 +30,7 @@ from prefmpc._sharding import check_mesh
 from prefmpc.learning._newton import Minimum, solve
 from prefmpc.learning._problem import Problem, answer_weights, build, build_answers, check
 from prefmpc.learning.losses import padded_size
-from prefmpc.learning.priors import Structure, WishartPrior
+from prefmpc.learning.priors import Structure, WishartPrior, paired
 from prefmpc.models.quadratic import QuadraticCost
 from prefmpc.preferences.answers import Answers, check_data
 from prefmpc.preferences.comparisons import Comparisons
@@ -192,9 +191,10 @@ class MapResult(Result):
         """
         Q0, R0 = (np.diag(np.diag(mode)) for mode in (self.prior.Q, self.prior.R))
         prior = WishartPrior(Q0, R0, self.prior.strength)
-        weights = self.problem.weights[: len(self.comparisons)]
-        data = self.comparisons, prior
-        return fit_map(*data, structure="diagonal", outputs=self.outputs, weights=weights)
+        data, weights = self.comparisons, None
+        if isinstance(data, Comparisons):
+            weights = self.problem.weights[: len(data)]
+        return fit_map(data, prior, structure="diagonal", outputs=self.outputs, weights=weights)
 
 
 def fit_map(
@@ -280,33 +280,12 @@ def fit_maps(
     -------
     list of MapResult
     """
-    data_sets, beliefs = _paired(comparisons, priors)
+    data_sets, beliefs = paired(comparisons, priors)
     results = _solved(data_sets, beliefs, structure, outputs, max_iterations, tol)
     if bad := [result for result in results if not result.success]:
         many = f" ({len(bad)} of {len(results)} problems)" if len(results) > 1 else ""
         warn_of_failure(bad[0], many)
     return results
-
-
-def _paired(
-    comparisons: Comparisons | Sequence[Comparisons],
-    priors: WishartPrior | Sequence[WishartPrior],
-) -> tuple[list[Comparisons], list[WishartPrior]]:
-    one_set, one_prior = isinstance(comparisons, Comparisons), isinstance(priors, WishartPrior)
-    data_sets: list[Any] = (
-        [comparisons] if one_set else instances("comparisons", comparisons, Comparisons)
-    )
-    beliefs: list[Any] = [priors] if one_prior else instances("priors", priors, WishartPrior)
-    if one_set:
-        data_sets *= len(beliefs)
-    elif one_prior:
-        beliefs *= len(data_sets)
-    if len(data_sets) != len(beliefs):
-        raise ValueError(
-            "comparisons and priors must be equally many, or one of them a single one, "
-            f"got {len(data_sets)} and {len(beliefs)}"
-        )
-    return data_sets, beliefs
 
 
 def _solved(

@@ -13,8 +13,9 @@ from typing import Any, Literal
 import numpy as np
 from jax.typing import ArrayLike
 
-from prefmpc._checks import is_whole, positive, positive_vector, sequence
+from prefmpc._checks import instances, is_whole, positive, positive_vector, sequence
 from prefmpc._matrices import psd_matrix
+from prefmpc.preferences.comparisons import Comparisons
 
 Structure = Literal["full", "diagonal"] | tuple[np.ndarray, np.ndarray]
 """Which entries of Q and R may differ from zero: by name, or as two masks (see `blocks`)."""
@@ -143,3 +144,25 @@ def free_entries(structure: Any, prior: WishartPrior) -> tuple[np.ndarray, np.nd
         pairs.append((rows + at, columns + at))
     (rows_Q, columns_Q), (rows_R, columns_R) = pairs
     return np.concatenate([rows_Q, rows_R]), np.concatenate([columns_Q, columns_R])
+
+
+def paired(
+    comparisons: Comparisons | Sequence[Comparisons],
+    priors: WishartPrior | Sequence[WishartPrior],
+) -> tuple[list[Comparisons], list[WishartPrior]]:
+    """Return as many data sets as priors: one of something goes with all of the other."""
+    one_set, one_prior = isinstance(comparisons, Comparisons), isinstance(priors, WishartPrior)
+    data_sets: list[Any] = (
+        [comparisons] if one_set else instances("comparisons", comparisons, Comparisons)
+    )
+    beliefs: list[Any] = [priors] if one_prior else instances("priors", priors, WishartPrior)
+    if one_set:
+        data_sets *= len(beliefs)
+    elif one_prior:
+        beliefs *= len(data_sets)
+    if len(data_sets) != len(beliefs):
+        raise ValueError(
+            "comparisons and priors must be equally many, or one of them a single one, "
+            f"got {len(data_sets)} and {len(beliefs)}"
+        )
+    return data_sets, beliefs

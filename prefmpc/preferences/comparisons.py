@@ -19,6 +19,7 @@ from prefmpc._random import generator
 from prefmpc.preferences.logs import answers_of, read
 from prefmpc.preferences.names import names_of
 from prefmpc.preferences.people import Preference, asked
+from prefmpc.preferences.pools import pairs_from_one_start
 from prefmpc.preferences.recordings import joined
 from prefmpc.preferences.trajectories import Trajectory, check_finite
 
@@ -124,7 +125,7 @@ class Comparisons:
             raise ValueError(f"trajectories must hold at least two to compare, got {count}")
         rng = generator(key)
         if flag("same_start", same_start):
-            first, second = _pairs_from_one_start(trajectories, size, rng)
+            first, second = pairs_from_one_start(trajectories, size, rng)
         else:
             first = rng.integers(0, count, size)
             second = (first + rng.integers(1, count, size)) % count
@@ -322,26 +323,6 @@ def check_pool(trajectories: Any) -> None:
             f"got batch shape {trajectories.batch_shape}"
         )
     check_finite("trajectories", trajectories, "closed loops that failed?")
-
-
-def _pairs_from_one_start(
-    trajectories: Trajectory, size: int, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
-    _, group = np.unique(np.asarray(trajectories.x[:, 0]), axis=0, return_inverse=True)
-    order = np.argsort(group, kind="stable")
-    count = np.bincount(group)
-    begin = np.cumsum(count) - count
-    place = np.argsort(order) - begin[group]  # of each trajectory among those with its start
-    candidates = np.flatnonzero(count[group] > 1)
-    if not candidates.size:
-        raise ValueError(
-            "trajectories must hold two with the same x(0) for same_start=True, "
-            f"all {order.size} start in different states"
-        )
-    first = rng.choice(candidates, size)
-    mates = count[group[first]]
-    gap = 1 + rng.integers(0, mates - 1)
-    return first, order[begin[group[first]] + (place[first] + gap) % mates]
 
 
 def _pair_indices(name: str, value: ArrayLike, size: int, count: int) -> np.ndarray:

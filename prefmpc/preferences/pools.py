@@ -132,3 +132,24 @@ def _stacks(weights: Any, size: int, system: LinearSystem) -> list[np.ndarray]:
             raise ValueError(f"weights[{i}] must have shape {(size, n, n)}, got {stack.shape}")
         out.append(stack)
     return out
+
+
+def pairs_from_one_start(
+    trajectories: Trajectory, size: int, rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return random pairs, first and second (size,), of trajectories (n_t,) with the same x(0)."""
+    _, group = np.unique(np.asarray(trajectories.x[:, 0]), axis=0, return_inverse=True)
+    order = np.argsort(group, kind="stable")
+    count = np.bincount(group)
+    begin = np.cumsum(count) - count
+    place = np.argsort(order) - begin[group]  # of each trajectory among those with its start
+    candidates = np.flatnonzero(count[group] > 1)
+    if not candidates.size:
+        raise ValueError(
+            "trajectories must hold two with the same x(0) for same_start=True, "
+            f"all {order.size} start in different states"
+        )
+    first = rng.choice(candidates, size)
+    mates = count[group[first]]
+    gap = 1 + rng.integers(0, mates - 1)
+    return first, order[begin[group[first]] + (place[first] + gap) % mates]
