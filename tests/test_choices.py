@@ -336,3 +336,18 @@ def test_learned_from_ties_the_probabilities_are_those_of_davidson():
     u = np.stack([z / 2, nu + 0 * z, -z / 2])
     P = np.exp(u - logsumexp(u, axis=0))
     np.testing.assert_allclose(P[0] / (P[0] + P[2]), expit(z))
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1e9])
+def test_no_scale_of_the_prior_is_too_small_or_too_large(scale):
+    prior = WishartPrior(scale * np.eye(2), [[scale]])
+    result = fit_map(MIXED, prior)
+    assert result.success, result.message
+    spread = result.problem.spread
+    t = {**dict.fromkeys(SIZES), **result.thresholds}
+    expected = by_formula(MIXED, result.Q, result.R, t) + sum(
+        float(values @ values) for values in result.thresholds.values()
+    ) / (2 * spread**2)
+    for W in (result.Q, result.R):
+        expected += np.trace(W) / scale - np.linalg.slogdet(W)[1]
+    assert result.objective == pytest.approx(expected, rel=1e-9)

@@ -151,7 +151,8 @@ class _Path(NamedTuple):
         log_det = 2 * jnp.sum(jnp.log(jnp.diag(factor(self.matrix(w)))))
         distance = prior.tightness * (self.precision @ w[:p]) - log_det
         value = self.total(self.data.loss(z)) + prior.strength * distance
-        return value if w.size == p else value + jnp.sum((w[p:] / self.spread) ** 2) / 2
+        units = w[p:] * (prior.tightness / self.spread)  # thresholds are of the size of σ
+        return value if w.size == p else value + units @ units / 2
 
     def begin(self) -> _Iterate:
         """Start at the mode of a prior so tight and strong that it is nearly the minimum."""
@@ -191,8 +192,9 @@ class _Path(NamedTuple):
         partner = jnp.where(exact, prior.strength * W_inverse, at.dual)
         bend = product_hessian(W_inverse, partner, self.entries)
         if more := at.w.size - pull.size:
-            pull = jnp.concatenate([pull, at.w[pull.size :] / self.spread**2])
-            bend = jax.scipy.linalg.block_diag(bend, jnp.eye(more) / self.spread**2)
+            precision = (prior.tightness / self.spread) ** 2
+            pull = jnp.concatenate([pull, at.w[pull.size :] * precision])
+            bend = jax.scipy.linalg.block_diag(bend, jnp.eye(more) * precision)
         gradient, hessian = gradient + pull, data_hessian + bend
         step, decrement = newton_step(hessian, gradient)
 
