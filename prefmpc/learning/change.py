@@ -186,7 +186,9 @@ def has_changed(
     both. Sharpness and lapse rate of each person are free in both parts, so that somebody who
     gets tired has not changed. The statistic has no law that we know (there is a prior, and
     answers are few): it is compared with that of answers that the fitted single σ gives to the
-    same questions, a parametric bootstrap.
+    same questions, a parametric bootstrap. The fitted one is a little too sharp, so that the test
+    is a little too eager: of 80 answers of people who had not changed, p was at most 0.1 in about
+    14 of 100 cases.
 
     Parameters
     ----------
