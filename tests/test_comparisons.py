@@ -391,3 +391,17 @@ def no_answer(first, second):
 def test_bad_input_is_named(call, words):
     with pytest.raises(ValueError, match=words):
         call()
+
+
+def test_data_sets_that_are_put_together_say_who_answered_or_do_not():
+    ann, bob, nobody = (
+        Comparisons(POOL, [0, 1], [1, 2], [1, 0], who)
+        for who in (["Ann", "Ann"], ["Bob", "Ann"], None)
+    )
+    both = Comparisons.concatenate([ann, bob])
+    assert both.who is not None
+    assert both.who.tolist() == ["Ann", "Ann", "Bob", "Ann"]
+    assert Comparisons.concatenate([nobody, nobody]).who is None
+    for other in (nobody, Comparisons(POOL, [0], [1], [1], [7])):
+        with pytest.raises(ValueError, match="sets must all say who answered in one way"):
+            Comparisons.concatenate([ann, other])

@@ -130,7 +130,10 @@ class Answers:
 
     @classmethod
     def from_comparisons(cls, comparisons: Comparisons) -> Answers:
-        """Return compared pairs as answers on a scale of 2: the same likelihood."""
+        """Return compared pairs as answers on a scale of 2: the same likelihood.
+
+        Who answered is not kept: `fit_raters` and the like take the comparisons themselves.
+        """
         instance("comparisons", comparisons, Comparisons)
         shown = np.stack([comparisons.first, comparisons.second], axis=1)
         grades = np.full(len(comparisons), 2)

@@ -185,10 +185,14 @@ class Comparisons:
     def concatenate(cls, sets: Sequence[Comparisons]) -> Comparisons:
         """Put data sets together, one after the other; a pool that they share stays one.
 
-        A ValueError says what does not fit. `Answers.concatenate` takes any lengths, and answers
-        of other kinds.
+        A ValueError says what does not fit: ``who`` is told in all sets or in none, by names of
+        one kind. `Answers.concatenate` takes any lengths, and answers of other kinds.
         """
         given: list[Any] = instances("sets", sets, Comparisons)
+        kinds = {None if one.who is None else one.who.dtype.kind for one in given}
+        if len(kinds) > 1:
+            named = [type(one.who).__name__ if one.who is None else one.who.dtype for one in given]
+            raise ValueError(f"sets must all say who answered in one way, or none, got {named}")
         trajectories, offsets = joined([one.trajectories for one in given])
         if not isinstance(trajectories, Trajectory):
             lengths = sorted({one.trajectories.horizon for one in given})
@@ -200,7 +204,9 @@ class Comparisons:
             np.concatenate([getattr(one, side) + k for one, k in zip(given, offsets, strict=True)])
             for side in ("first", "second")
         )
-        return cls(trajectories, first, second, np.concatenate([one.labels for one in given]))
+        labels = np.concatenate([one.labels for one in given])
+        who = None if None in kinds else np.concatenate([one.who for one in given])
+        return cls(trajectories, first, second, labels, who)
 
     def subset(self, index: ArrayLike) -> Comparisons:
         """Return the comparisons chosen by an integer or boolean index, in that order."""
