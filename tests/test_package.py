@@ -19,7 +19,7 @@ import pytest
 
 import prefmpc
 
-LINES, CODE = 18_800, 12_600
+LINES, CODE = 19_800, 13_000
 """The library has at most so many lines, and so many without docstrings, comments and blanks."""
 
 FILE, FUNCTION, HOUR = 350, 60, 3_500
