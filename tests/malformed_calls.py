@@ -365,6 +365,7 @@ def valid_calls():
                 **{"system": SYSTEM, "prior": PRIOR, "x0": np.ones(2), "key": KEY, "spread": 2.0},
                 **{"structure": "diagonal", "sharpness": 2.0, "coupling": 0.5, "steps": 3},
                 **{"controller": "mpc", "horizon": 3, "constraints": LIMITS, "pool": POOL},
+                **{"reference": None},
                 **{"choose": "information", "lapse": 0.0, "repeat_every": 8, "samples": 50},
             },
         ),
