@@ -135,7 +135,7 @@ failed pool, pool, shorter pool, trajectory | second_moments: trajectory, max_in
 failed pool, pool, shorter pool, trajectory | settling_time: trajectory, select: trajectory
 longer, wider, with 1e308 | radius, SeparableCost.start: scale, ICNNCost.random: scale
 longer, wider, with 1e308 | MLPCost.random: scale
-True | bias, even, progress, nearest
+True | bias, even, progress, nearest, saturate
 cost, costs | fit_network: initial, BatchedMPC: cost, closed_loops: costs, mpc_rollout: cost
 longer, wider | bryson: u_max, index, x_max
 plant, plants | BatchedMPC: system, closed_loops: system, mpc_rollout: system
@@ -184,7 +184,7 @@ None, negative | outputs
 one more, prior | priors
 None, comparisons | validation
 [], one more | output_cones
-None, first negative, ragged | steady_state: start
+None, first negative, first with 1e308, ragged | steady_state: start
 None, plant, plants | plants
 None, deeper, raises, says NaN, says a matrix, says nothing, says text | Interview: x0
 raises, says NaN, says a matrix, says nothing, says text | Interview: controller
@@ -205,7 +205,8 @@ True | overwrite, export_c: disturbance
 1.5, 10^30, inf, None, flatter, with 1e308, with inf | max_increment
 1.5, 10^30, inf, flatter, with 1e308, with inf | soft
 0, 1.5, 10^30 | soft_quadratic
-None | blocks, export_c: tol, KalmanEstimator.reset: x0
+None | blocks, export_c: tol
+None, negative, with 1e308 | KalmanEstimator.reset: x0
 None, negative | B_d, C_d
 None, negative, with 1e308 | OutputFeedback: y_r, y_r
 None, longer, negative | states

@@ -92,13 +92,14 @@ def solve(problem: CondensedProblem, x0: Any, tol: Any, *, start: Any = None) ->
     found = _judged(data, still, none, data.free, error, n, jnp.zeros(dead.shape, int), tol)
     if problem.fixed is None:
         found = _active_set(problem, data, start, found, dead, tol)
-    ended = jax.lax.cond(
-        jnp.all(found.done | dead),
-        lambda found: (found, no, no),
-        lambda found: _left_over(problem, data, start, found, dead, tol),
-        found,
-    )
-    found, infeasible, limited = ended
+    infeasible = limited = no
+    if dead.size:
+        found, infeasible, limited = jax.lax.cond(
+            jnp.all(found.done | dead),
+            lambda found: (found, no, no),
+            lambda found: _left_over(problem, data, start, found, dead, tol),
+            found,
+        )
     if problem.fixed is None:  # input bounds alone always leave a plan, however bad
         infeasible = no
     low, high = problem.bounds[:, :1], problem.bounds[:, 1:]

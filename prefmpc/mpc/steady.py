@@ -84,12 +84,13 @@ def steady_state(
     search: Any = _held if isinstance(system, LinearSystem) else _search
     if disturbance is not None:
         if not isinstance(system, LinearSystem):
-            raise ValueError("disturbance must be None for a plant that is not linear")
+            raise ValueError("disturbance must be None for a system that is not linear")
         d = np.asarray(finite_array("disturbance", disturbance, ndim=1))
         search = partial(_held, push=np.asarray(shaped("disturbance", d, (system.nx,))))
     found = search(system, wanted, Z, x, u)
     if found is None:
         within = " within the constraints" if len(Z.h) else ""
+        within += " and with this disturbance" if disturbance is not None else ""
         raise ValueError(
             f"y_r must have a steady state, but none was found{within} near y_r = {wanted}"
         )
@@ -137,7 +138,8 @@ def check_reference(
             size = _typical(system, reference)[: system.nx]
     if not (drift <= REACHED * size).all():
         raise ValueError(
-            f"reference must be a steady state, but its next state moves by {drift.max()}"
+            f"reference must be a steady state{'' if push is None else ' with this disturbance'}, "
+            f"but its next state moves by {drift.max()}"
         )
 
 

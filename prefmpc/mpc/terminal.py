@@ -119,6 +119,8 @@ def terminal_ingredients(
     single("system", system)
     single("cost", cost)
     max_steps, tol = positive_int("max_steps", max_steps), nonnegative("tol", tol)
+    if tol >= 1:
+        raise ValueError(f"tol must be below 1, got {tol}")
     Z = stage_constraints(system, constraints)
     if (Z.h <= 0).any():
         raise ValueError(
