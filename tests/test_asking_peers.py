@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 
 import numpy as np
-import pytest
 from stored_studies import BOOK
 
 from studies import read_spread
@@ -14,7 +13,6 @@ from studies.asking import COUNTS, PEOPLE
 PATH = BOOK / "extensions" / "asking_peers.json"
 
 
-@pytest.mark.skipif(not PATH.exists(), reason="nobody has run benchmarks/asking_peers.py yet")
 def test_the_table_is_that_of_the_draws():
     head = json.loads(PATH.read_text(encoding="utf-8"))
     regret = read_spread(PATH)["regret"]

@@ -12,7 +12,7 @@ from studies import asking, asking_limits, read_spread
 from studies.__main__ import BOOK, STUDIES
 
 KEY = jax.random.key(1000)
-LEAST = {"asking": 100, "fewer": 100, "stopping": 25, "limits": 20, "settled": 15}
+LEAST = {"asking": 60, "fewer": 100, "stopping": 25, "limits": 20, "settled": 15}
 
 
 def test_a_regret_does_not_depend_on_what_else_is_raced():
