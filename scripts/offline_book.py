@@ -2,7 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
+
+THEME = {
+    '<button class="btn search-button-field search-button__button pst-js-only" title="Search" '
+    'aria-label="Search"': '<button class="btn search-button-field search-button__button '
+    'pst-js-only" title="Search"',
+    'theme-switch-button pst-js-only" aria-label="Color mode" data-bs-title="Color mode"  '
+    'data-bs-placement="bottom" data-bs-toggle="tooltip">': 'theme-switch-button pst-js-only" '
+    'data-bs-title="Color mode" data-bs-placement="bottom" data-bs-toggle="tooltip">'
+    '<span class="visually-hidden">Color mode</span>',
+    '<summary><span class="toctree-toggle"': '<summary aria-label="Pages below"><span '
+    'class="toctree-toggle"',
+}
+"""What the theme writes, and the same with the names that its buttons lack or have wrongly."""
 
 
 def use_svg_math(app: Any, config: Any) -> None:
@@ -39,8 +53,20 @@ def name_by_text(app: Any, pagename: str, templatename: str, context: Any, doctr
         context["body"] = context["body"].replace(f"<summary{label}>", "<summary>")
 
 
+def name_buttons(app: Any, error: Exception | None) -> None:
+    """Let the theme's own buttons be called what stands on them."""
+    if error is None and app.builder.format == "html":
+        for path in Path(app.outdir).rglob("*.html"):
+            old = new = path.read_text(encoding="utf-8")
+            for part, better in THEME.items():
+                new = new.replace(part, better)
+            if new != old:
+                path.write_text(new, encoding="utf-8")
+
+
 def setup(app: Any) -> dict[str, bool]:
     app.connect("config-inited", use_svg_math, priority=900)
     app.connect("html-page-context", drop_duplicates, priority=0)
     app.connect("html-page-context", name_by_text)
+    app.connect("build-finished", name_buttons)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
