@@ -112,28 +112,25 @@ def restart(browser: Browser) -> None:
 def run_cell(browser: Browser, count: int) -> None:
     """Run the cell, and wait until it asks the question after so many answers.
 
-    A slow server asks which kernel is meant, once it is there.
+    A slow server asks which kernel is meant when one is there already. Then there is another, and
+    what the first one began is lost: the cell is run again, as a person would.
     """
-    running = (
-        "document.querySelector('.jp-CodeCell .jp-InputPrompt').textContent.includes('*')"
-        " || document.querySelector('.ask-count') !== null"
-    )
     enter = {"key": "Enter", "windowsVirtualKeyCode": 13, "modifiers": 8, "text": "\r"}
-    for _ in range(LONG // 5):
+    for _ in range(LONG // 30):
         browser(f"{ACCEPT}?.click()")
+        browser.wait(IDLE, LONG)
         browser("document.querySelector('.jp-CodeCell .cm-content').focus()")
         for kind in ("keyDown", "keyUp"):
             browser.call("Input.dispatchKeyEvent", type=kind, **enter)
         with contextlib.suppress(TimeoutError):
-            browser.wait(running, 5)
-            break
-    wait_for(browser, count)
+            return wait_for(browser, count, 30)
+    return wait_for(browser, count)
 
 
-def wait_for(browser: Browser, count: int) -> None:
+def wait_for(browser: Browser, count: int, seconds: float = LONG) -> None:
     """Wait for the question that comes after so many answers."""
     shown = "document.querySelector('.ask-count')?.textContent"
-    browser.wait(f"{shown} === 'Question {count + 1}'", LONG)
+    browser.wait(f"{shown} === 'Question {count + 1}'", seconds)
 
 
 def choose(browser: Browser, number: int) -> float:
