@@ -13,10 +13,11 @@ THEME = {
     'data-bs-placement="bottom" data-bs-toggle="tooltip">': 'theme-switch-button pst-js-only" '
     'data-bs-title="Color mode" data-bs-placement="bottom" data-bs-toggle="tooltip">'
     '<span class="visually-hidden">Color mode</span>',
+    '<summary aria-label="Toggle hidden content">': "<summary>",
     '<summary><span class="toctree-toggle"': '<summary aria-label="Pages below"><span '
     'class="toctree-toggle"',
 }
-"""What the theme writes, and the same with the names that its buttons lack or have wrongly."""
+"""What theme and folded cells write, and the same with names that buttons lack or have wrongly."""
 
 
 def use_svg_math(app: Any, config: Any) -> None:
@@ -46,15 +47,8 @@ def drop_duplicates(app: Any, pagename: str, templatename: str, context: Any, do
         context[kind][:] = kept
 
 
-def name_by_text(app: Any, pagename: str, templatename: str, context: Any, doctree: Any) -> None:
-    """Let what opens a folded cell be called what stands on it, for who hears or speaks it."""
-    if "body" in context:
-        label = ' aria-label="Toggle hidden content"'
-        context["body"] = context["body"].replace(f"<summary{label}>", "<summary>")
-
-
 def name_buttons(app: Any, error: Exception | None) -> None:
-    """Let the theme's own buttons be called what stands on them."""
+    """Let what can be pressed be called what stands on it, for who hears or speaks it."""
     if error is None and app.builder.format == "html":
         for path in Path(app.outdir).rglob("*.html"):
             old = new = path.read_text(encoding="utf-8")
@@ -67,6 +61,5 @@ def name_buttons(app: Any, error: Exception | None) -> None:
 def setup(app: Any) -> dict[str, bool]:
     app.connect("config-inited", use_svg_math, priority=900)
     app.connect("html-page-context", drop_duplicates, priority=0)
-    app.connect("html-page-context", name_by_text)
     app.connect("build-finished", name_buttons)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

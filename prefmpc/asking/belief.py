@@ -277,21 +277,22 @@ class Belief:
         def point(x: np.ndarray, k: np.ndarray) -> np.ndarray:
             return laplace.at[k] + np.einsum("mij,mj->mi", laplace.roots[k], x)
 
-        def excess(x: np.ndarray, i: Any, levels: np.ndarray = which) -> np.ndarray:
+        def excess(x: np.ndarray, k: np.ndarray) -> np.ndarray:
             """Return log posterior − log of the level's Gaussian, up to a constant of the level."""
-            k = levels[i]
             energy = self._energy(point(x, k), LEVELS[k], gap, labels, lapse)
             return 0.5 * (x**2).sum(-1) - energy
 
+        def here(x: np.ndarray, i: np.ndarray) -> np.ndarray:
+            return excess(x, which[i])
+
         constant = np.linalg.slogdet(laplace.roots)[1] - 0.5 * LEVELS**2
-        every = np.arange(count)
-        height = excess(x, every) if slices else np.zeros(count)
+        height = excess(x, which) if slices else np.zeros(count)
         for _ in range(slices):
-            x, height = _slice(x, height, excess, rng)
+            x, height = _slice(x, height, here, rng)
             # To the same place relative to the Gaussian of another level.
             step = np.where(rng.uniform(size=count) < 0.5, -1, 1)
             other = np.clip(which + step, 0, len(LEVELS) - 1)
-            there = excess(x, every, other)
+            there = excess(x, other)
             gain = there + constant[other] - height - constant[which]
             moves = np.log(rng.uniform(size=count)) < gain
             which[moves], height[moves] = other[moves], there[moves]
